@@ -1,4 +1,4 @@
-"""Read a result folder, and build the view of a result for figures and report."""
+"""Read a result folder, and collect the data for the figures and the report of the result."""
 
 from __future__ import annotations
 
@@ -21,22 +21,26 @@ from impact_posture.system.arrays import Array
 from impact_posture.system.npz_files import read_arrays
 from impact_posture.system.text_files import read_text
 
-# Matplotlib is imported where it is used, because that takes longer than a small problem.
+# Import matplotlib only where it is used, because the import takes longer than solving a small problem.
 if TYPE_CHECKING:
     from impact_posture.output.plot import ResultView, TradeOffData
     from impact_posture.path.posture_path import PosturePath
     from impact_posture.robot.robot import Robot
 
-# Exceptions from reading a changed or incomplete result.
+# Exceptions that a changed or incomplete result can cause.
 _BROKEN = (LookupError, ValueError, TypeError, AttributeError, OSError, RecursionError)
 
 
 @dataclass(frozen=True, eq=False)
 class SolvedPostures:
-    """The postures and numbers of a result folder.
+    """Postures and numbers from a result folder.
 
-    Postures have the shape (nq,).  ``path`` is the null-space path between them, ``document`` the content of
-    ``result.json``, and ``mapped`` the self-motion map, if it was computed.
+    Attributes:
+        initial: Initial posture, shape (nq,).
+        optimal: Optimal posture, shape (nq,).
+        path: Null-space path between both postures.
+        document: Content of ``result.json``.
+        mapped: Map of the self-motion manifold; ``None`` if it was not computed.
     """
 
     initial: Array
@@ -47,7 +51,7 @@ class SolvedPostures:
 
 
 def load_view(folder: Path) -> ResultView:
-    """Read the view of a result folder; see :func:`load_result` for errors."""
+    """Read the data for the figures of a result folder; errors are as in :func:`load_result`."""
     return load_result(folder)[1]
 
 
@@ -55,7 +59,7 @@ def rewrite_report(folder: Path, *, meshes: bool = False) -> Path:
     """Write ``report.html`` of a result folder again; return its path.
 
     Raises:
-        SpecError: As :func:`load_result`.
+        SpecError: As in :func:`load_result`.
         OutputError: The report cannot be written.
     """
     from impact_posture.output.report.result_report import write_result_report
@@ -68,10 +72,10 @@ def rewrite_report(folder: Path, *, meshes: bool = False) -> Path:
 
 
 def load_result(folder: Path) -> tuple[Prepared, ResultView, dict[str, Any]]:
-    """Read problem, view and ``result.json`` of a result folder.
+    """Read the problem, the data for figures, and ``result.json`` from a result folder.
 
     Raises:
-        SpecError: The folder is not a whole result, or was made with another robot model.
+        SpecError: The folder is not a complete result, or was written for another robot model.
     """
     if not os.path.isfile(folder / "result.json"):
         raise SpecError("holds no result.json", where=str(folder), hint="name a folder that optimize wrote")
@@ -110,7 +114,7 @@ def _broken(folder: Path, error: Exception) -> SpecError:
 
 
 def motion_of(folder: Path, document: dict[str, Any], robot: Robot) -> PosturePath | None:
-    """Read the path to the optimum from a result folder, if it has one."""
+    """Read the path to the optimum from a result folder; ``None`` if the result has no path."""
     if "path" not in document:
         return None
     from impact_posture.path.path_files import read_path
@@ -119,7 +123,7 @@ def motion_of(folder: Path, document: dict[str, Any], robot: Robot) -> PosturePa
 
 
 def result_view(prepared: Prepared, postures: SolvedPostures, motion: PosturePath | None) -> ResultView:
-    """Return the view of a result for its figures and report; ``motion`` is the path to the optimum, if searched."""
+    """Return the data for the figures and the report of a result.  ``motion`` is the path to the optimum."""
     from impact_posture.output.plot import ResultView
 
     impact, around, document = prepared.impact, prepared.problem.surroundings, postures.document
@@ -140,7 +144,7 @@ def result_view(prepared: Prepared, postures: SolvedPostures, motion: PosturePat
 
 
 def _collisions(prepared: Prepared, *postures: Array) -> Any:
-    """Return the colliding shapes at each posture.  An optimization with surroundings has none."""
+    """Return the colliding shapes at each posture.  With surroundings, the optimization excludes collisions."""
     if prepared.problem.surroundings is not None:
         return (), ()
     from impact_posture.collision.mesh_check import mesh_collisions
@@ -157,7 +161,7 @@ def _tradeoff_data(points: Sequence[dict[str, Any]], against: Against) -> TradeO
     if len(points) < 2:
         return None
     keys = ("within", "objective", "H", "G", "V", "S")
-    # A missing S becomes NaN.
+    # An undefined S is ``None`` in the JSON file and becomes NaN here.
     columns = {key: np.array([p[key] for p in points], dtype=float) for key in keys}
     knee = next((k for k, p in enumerate(points) if p["knee"]), None)
     certified = np.array([bool(p["certified"]) for p in points])

@@ -378,7 +378,9 @@ def test_bad_input(flying: RunView, pushed: RunView, tmp_path: Path) -> None:
         dataclasses.replace(flying, t=flying.t[::-1])
     with pytest.raises(InputError, match="there is no run to draw"):
         figures_of_comparison([])
-    with pytest.raises(InputError, match=r"robot of nominal is solo8, of nominal tilthex_arm.*same scenario"):
+    with pytest.raises(
+        InputError, match=r"robot of nominal is solo8, but for nominal it is tilthex_arm.*same scenario"
+    ):
         snapshots_figure([flying, pushed])
     with pytest.raises(InputError, match="no format 'gif'"):
         save(metric_figure(flying), tmp_path, "metric", ("gif",))

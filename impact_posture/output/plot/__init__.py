@@ -1,9 +1,10 @@
-"""Figures of a result: :func:`draw_all` writes them, the ``*_figure`` functions return matplotlib figures.
+"""Figures of results and of simulated runs.
 
-Figures of simulated runs: :func:`figures_of_run`, :func:`figures_of_comparison` and :func:`bars_figure`.
+:func:`draw_all` writes the figures of a result.  :func:`figures_of_run`, :func:`figures_of_comparison` and
+:func:`bars_figure` return the figures of simulated runs.
 
-A figure raises :class:`~impact_posture.errors.InputError` if there is no data for it, or if its runs are of
-different scenarios or robots.  The package does not change the global state of pyplot and shows no window.
+A function raises :class:`~impact_posture.errors.InputError` if there is no data for its figure, or if the runs belong
+to different scenarios or robots.  The package does not change the global state of pyplot and shows no window.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ __all__ = [
     "save_all",
 ]
 
-# The slowest figures come first, so that parallel processes end together.
+# The figures that take longest come first, so that parallel processes end at about the same time.
 FIGURES: dict[str, Callable[[ResultView], Figure]] = {
     "jump": jump_figure.jump_figure,
     "ellipsoid": ellipsoid_figure.ellipsoid_figure,
@@ -59,7 +60,7 @@ FIGURES: dict[str, Callable[[ResultView], Figure]] = {
 
 
 def drawable(view: ResultView) -> list[str]:
-    """Return the names of the figures that the view has data for."""
+    """Return the names of the figures for which the view has data."""
     lacking = {
         "nullspace": view.path is None,
         "tradeoff": view.tradeoff is None,
@@ -81,14 +82,14 @@ def draw_all(
     """Write the figures of ``view`` into ``out`` as ``<name>.<format>``; return the paths.
 
     Args:
-        view: The result.
-        out: Folder, made if missing; files of the same name are replaced.
-        formats: Some of ``png``, ``svg`` and ``pdf``.
-        only: Names of :data:`FIGURES` to draw; all of :func:`drawable` if ``None``.
+        view: Result to draw.
+        out: Folder, which is created if it is missing.  Files with the same name are replaced.
+        formats: File formats: ``png``, ``svg`` or ``pdf``.
+        only: Names of the figures to draw, from :data:`FIGURES`; ``None`` for all :func:`drawable` figures.
 
     Raises:
-        FigureNotFound: An unknown name in ``only``.
-        InputError: An unknown format, or a figure in ``only`` that the view has no data for.
+        FigureNotFound: A name in ``only`` is unknown.
+        InputError: A format is unknown, or the view has no data for a figure in ``only``.
         OutputError: The folder or a file cannot be written.
     """
     wanted = check_formats(formats)

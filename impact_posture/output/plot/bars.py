@@ -1,4 +1,4 @@
-"""Figure ``bars``: motion during impacts for each controller and scenario, beside the numbers of the paper."""
+"""Figure ``bars``: motion during impacts for each controller and scenario, compared with Afifi et al. 2026."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ NOTES = (
     "∫‖ν‖dt mixes meters and radians, as in the paper. Intervals: 95 % of the mean over the seeds. The paper prints "
     "no gains. Compare its numbers with each other only.",
 )
-# The axis includes numbers of the paper up to this multiple of the largest mean.
+# The axis is long enough for values of the paper up to this multiple of the largest mean.
 _FAR = 2.0
 
 
 @dataclass(frozen=True)
 class Bar:
-    """``q_total_impact = ∫‖ν‖dt`` of a controller over the impact windows of a scenario, which has its own panel.
+    """Bar for one controller in one scenario: ``q_total_impact = ∫‖ν‖dt`` over the impact windows.
 
     Attributes:
-        mean: Mean over the runs; NaN where no run completed.
-        half_width: Half of the 95 % interval; 0 for a single run.
-        paper: Number of the paper for the same controller, if the paper has it.
+        mean: Mean over the runs; NaN if no run completed.
+        half_width: Half width of the 95 % interval; 0 for a single run.
+        paper: Value in the paper for the same controller; ``None`` if the paper has no value.
     """
 
     scenario: str
@@ -42,7 +42,7 @@ class Bar:
 
 
 def bars_figure(rows: Sequence[Bar]) -> Figure:
-    """Draw horizontal bars with intervals and the numbers of the paper, in rows of two panels."""
+    """Draw horizontal bars with intervals and the values of the paper.  Each scenario has a panel."""
     if not rows:
         raise InputError("there is nothing to draw", where="figure bars", hint="give at least one row")
     scenarios = list(dict.fromkeys(row.scenario for row in rows))
@@ -65,7 +65,7 @@ def bars_figure(rows: Sequence[Bar]) -> Figure:
 def _panel(axes: Any, name: str, group: Sequence[Bar], room: int) -> None:
     ours = max((row.mean + row.half_width for row in group if np.isfinite(row.mean)), default=0.0)
     papers = [row.paper for row in group if row.paper is not None]
-    # The paper used another robot.  The numbers of the paper must not make the bars short.
+    # The paper used another robot, so its values can be much larger.  They must not make the bars short.
     near = [paper for paper in papers if paper <= _FAR * ours or ours == 0]
     end = 1.08 * (max([ours, *near]) or 1.0)
     for place, row in enumerate(group):
@@ -75,7 +75,7 @@ def _panel(axes: Any, name: str, group: Sequence[Bar], room: int) -> None:
                 axes.errorbar(row.mean, place, xerr=row.half_width, color=INK, linewidth=1.0, capsize=2.5, zorder=4)
         if row.paper is not None:
             axes.plot(min(row.paper, 0.975 * end), place, **(_PAPER if row.paper in near else _BEYOND))
-        # The numbers are drawn to the right of the panel, where no bar covers them.
+        # The values are written to the right of the panel, where no bar covers them.
         look = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points", "va": "center", "fontsize": 7}
         axes.annotate(_words(row), (1.0, place), (5, 0), **look)
     axes.set_xlim(0.0, end)
@@ -96,7 +96,7 @@ _BEYOND = _PAPER | {"marker": ">", "markersize": 6}
 
 
 def _words(row: Bar) -> str:
-    """Format mean and interval with the digits that the interval supports, and the number of the paper."""
+    """Format mean, interval and value of the paper.  The half width of the interval has two significant digits."""
     paper = f"\npaper {number(row.paper)}" if row.paper is not None else ""
     if not np.isfinite(row.mean):
         return "no run ended" + paper

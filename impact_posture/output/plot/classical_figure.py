@@ -1,4 +1,4 @@
-"""Figure ``classical``: velocity, force and impact ellipsoids in the same panels, each in its own unit."""
+"""Figure ``classical``: velocity, force and impact ellipsoids in the same panels, with different units."""
 
 from __future__ import annotations
 
@@ -28,20 +28,22 @@ _LOOKS: dict[str, dict[str, Any]] = {
     "force": {"color": VERMILLION, "linestyle": (0, (1, 1.2)), "linewidth": 1.6, "zorder": 3.6},
     "impact": {"color": BLUE, "linestyle": "-", "linewidth": 1.8, "zorder": 3.0},
 }
-# Half-length of an unbounded ellipsoid as drawn, in units of the panel.
+# Unbounded ellipsoids are drawn with this half-length, in units of the panel.
 _ENDLESS = 1e3
 
 
 @dataclass(frozen=True, eq=False)
 class Kind:
-    """A kind of ellipsoid in both postures: ``velocity``, ``force`` or ``impact``.
+    """Velocity, force or impact ellipsoid in the initial and the optimal posture.
 
     Attributes:
+        name: ``velocity``, ``force`` or ``impact``.
+        formula: Formula of the matrix, for the legend.
         unit: Unit of the semi-axes.
-        scale: The longest finite semi-axis before.
-        matrices: Before and after, divided by ``scale²``; unbounded directions are cut far outside of the panel.
-        finite: The same without the unbounded directions.
-        endless: Unbounded directions as columns, before and after.
+        scale: Longest finite semi-axis in the initial posture.
+        matrices: Matrices before and after, divided by ``scale²``.  Unbounded directions end far outside the panel.
+        finite: Like ``matrices``, but with zero in the unbounded directions.
+        endless: Unbounded directions before and after, as columns of shape (3, k).
     """
 
     name: str
@@ -54,12 +56,12 @@ class Kind:
 
     @property
     def label(self) -> str:
-        """Legend entry with the scale."""
+        """Legend entry: name, formula and scale."""
         return f"{self.name}  {self.formula}:  1 = {number(self.scale)} {self.unit}"
 
 
 def kinds_of(view: ResultView) -> list[Kind]:
-    """Return the three kinds of ellipsoids, scaled for comparison."""
+    """Return velocity, force and impact ellipsoids, scaled for comparison."""
     products = [J @ J.T for J in (view.jacobian(view.q_initial), view.jacobian(view.q_optimal))]
     impact = [view.before.ellipsoid, view.after.ellipsoid]
     bounded = np.zeros((3, 0))
@@ -81,8 +83,8 @@ def kinds_of(view: ResultView) -> list[Kind]:
 def classical_figure(view: ResultView) -> Figure:
     """Draw the shadows of ``JJᵀ``, ``(JJᵀ)⁻¹`` and ``Λ_c`` on the coordinate planes: before above, after below.
 
-    All panels share a scale, and each kind has its own unit.  If ``JJᵀ`` is singular, the force ellipsoid is
-    unbounded and leaves the panel.  The label of the panel says so.
+    All panels share a scale, but the three ellipsoids have different units.  If ``JJᵀ`` is singular, the force
+    ellipsoid is unbounded, and the label of its panel states this.
     """
     kinds = kinds_of(view)
     limit = 1.18 * max(1.0, *(_longest(matrix) for kind in kinds for matrix in kind.finite))
@@ -110,7 +112,7 @@ def _longest(matrix: Array) -> float:
 
 
 def _unbounded(plane: Plane, kind: Kind, which: int) -> str:
-    """Return a line on the unbounded directions of a kind in the plane; empty if there are none."""
+    """Return a text if the shadow of an ellipsoid on the plane is unbounded; otherwise an empty text."""
     directions = kind.endless[which]
     seen = np.linalg.svd(plane.axes @ directions, compute_uv=False) if directions.shape[1] else np.zeros(0)
     rank = int((seen > 1e-6).sum())

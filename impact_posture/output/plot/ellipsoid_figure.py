@@ -42,7 +42,7 @@ from impact_posture.output.plot.style import (
 )
 from impact_posture.system.arrays import Array
 
-# Length of arrows as a share of the panel's limit.  Worst normals on the edge of the cone end on its rim.
+# Length of arrows as a share of the limit of the panel.  The drawn cone has the same length.
 REACH = 0.92
 _FREE = "Free (thin): the same robot with feet that are not held."
 _CONE = "The objective counts the worst normal of the cone. All equally bad normals are drawn."
@@ -55,7 +55,7 @@ NOTES = (
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """A curve: name in the legend, quantities of the posture, line, and whether the feet are free."""
+    """Ellipsoid to draw: name in the legend, quantities ``at`` the posture, line style; ``free``: no supports."""
 
     word: str
     at: ImpactQuantities
@@ -67,8 +67,8 @@ def ellipsoid_figure(view: ResultView) -> Figure:
     """Draw Λ_c before (dashed) and after (solid): shadows on the coordinate planes, and in 3-D with √H along n.
 
     Shadows on planes that contain n have tangent lines at ±√H.  If no coordinate plane contains n, the upright plane
-    through n is added.  All axes are equal and share one scale.  Thin lines show the ellipsoids without the feet.  An
-    uncertain normal has a cone and its worst normals.
+    through n is added.  All axes are equal and share one scale.  Thin lines show the ellipsoids without support feet.
+    For an uncertain normal, the figure shows the cone of normals and the worst normals.
     """
     states = [_State("before", view.before, BEFORE), _State("after", view.after, AFTER)]
     for word, free, line in zip(("before", "after"), view.free, (FREE_BEFORE, FREE_AFTER), strict=False):
@@ -95,13 +95,13 @@ def ellipsoid_figure(view: ResultView) -> Figure:
 
 
 def common_limit(matrices: list[Array]) -> float:
-    """Return half the side of a cube that holds all ellipsoids with a margin; 1 if all are points."""
+    """Return half the side of a cube that contains all ellipsoids with a margin; 1 if all ellipsoids are points."""
     widest = max(float(np.linalg.eigvalsh(matrix)[-1]) for matrix in matrices)
     return 1.18 * float(np.sqrt(widest)) if widest > 0 else 1.0
 
 
 def square_panel(axes: Any, plane: Plane, limit: float, unit: str) -> None:
-    """Make a panel with equal axes from ``-limit`` to ``limit``, a faint cross and labels with the unit."""
+    """Give a panel equal axes from ``-limit`` to ``limit``, faint lines through zero, and labels with the unit."""
     axes.set_xlim(-limit, limit)
     axes.set_ylim(-limit, limit)
     axes.set_aspect("equal", adjustable="box")
@@ -114,7 +114,7 @@ def square_panel(axes: Any, plane: Plane, limit: float, unit: str) -> None:
 
 
 def draw_normals(axes: Any, plane: Plane, named: list[tuple[str, Array]], limit: float) -> None:
-    """Draw the projection of each normal as an arrow, or as a dot (towards the reader) or cross (away)."""
+    """Draw the projection of each normal as an arrow; if n points out of the page, as a dot; into it, as a cross."""
     for name, n in named:
         flat = plane.axes @ n
         if np.linalg.norm(flat) < 0.05:
@@ -134,7 +134,7 @@ def _panel(axes: Any, plane: Plane, states: list[_State], limit: float, unit: st
 
 
 def _tangents(axes: Any, plane: Plane, state: _State, limit: float) -> None:
-    """Draw the two tangent lines of the shadow across n."""
+    """Draw the two tangent lines of the shadow that are perpendicular to n."""
     flat = plane.axes @ state.at.normal
     flat = flat / np.linalg.norm(flat)
     along = np.array([-flat[1], flat[0]]) * 3 * limit
@@ -145,14 +145,14 @@ def _tangents(axes: Any, plane: Plane, state: _State, limit: float) -> None:
 
 
 def normals(before: ImpactQuantities, after: ImpactQuantities) -> list[tuple[str, Array]]:
-    """Return name and direction of n, or of both normals if n turned with the contact frame."""
+    """Return name and direction of n; two normals if n is fixed to the contact frame and turns with it."""
     if np.linalg.norm(before.normal - after.normal) < 1e-3:
         return [("n", after.normal)]
     return [("n₀", before.normal), ("n₁", after.normal)]
 
 
 def normal_label(named: list[tuple[str, Array]]) -> str:
-    """Return the legend entry of :func:`normals`."""
+    """Return the legend entry for the normals from :func:`normals`."""
     return "n, out of the surface" if len(named) == 1 else "n₀ before, n₁ after"
 
 
@@ -192,26 +192,26 @@ def _legend(axes: Any, states: list[_State], unit: str, view: ResultView) -> Non
         radii = np.sqrt(np.maximum(np.linalg.eigvalsh(state.at.ellipsoid)[::-1], 0.0))
         largest = max(float(radii[0]), 1e-300)
         rows.append(f"{state.word}  " + "  ".join(number(r if r > 1e-7 * largest else 0.0) for r in radii))
-    # The radii are written below the legend, for any length of the legend.
+    # The annotation is relative to the legend, so the semi-axes are always below it.
     look = {"xycoords": legend, "textcoords": "offset points", "va": "top", "fontsize": 7.0, "linespacing": 1.4}
     axes.annotate("\n".join(rows), (0, 0), (0, -8), **look)
 
 
 def draw_uncertainty(axes: Any, plane: Plane, view: ResultView, limit: float) -> None:
-    """Draw the shadow of the cone (two cones if n turned) and the worst normals before and after."""
+    """Draw the shadow of the cone of normals and the worst normals.  If n turns, draw a cone for each posture."""
     for n in _cones(view):
         outline = cone_shadow(n, view.objective.normal_cone_deg, REACH * limit, plane.axes)
         axes.fill(*outline, facecolor=PALE, edgecolor="none", alpha=0.55, zorder=0.5)
         axes.plot(*outline, color=GRAY, linewidth=0.6, zorder=0.6)
     for word, worst, _, line in _worst(view):
         for normal in worst.normals:
-            # Dashed lines are drawn on top, as for the ellipsoids.
+            # Dashed lines are on top, so solid lines below them stay visible.
             zorder = 4.6 if word == "before" else 4.5
             draw_arrow(axes, np.zeros(2), plane.axes @ normal * REACH * limit, zorder, mutation_scale=8, **line)
 
 
 def draw_uncertainty_3d(axes: Any, view: ResultView, limit: float) -> None:
-    """Draw the surface and rim of the cone, and the worst normals."""
+    """Draw the cone of normals and the worst normals in 3-D."""
     for n in _cones(view):
         rim = cone_rim(n, view.objective.normal_cone_deg, limit, 49)
         sheet = [row[None] * [[0.0], [1.0]] for row in rim]
@@ -223,7 +223,7 @@ def draw_uncertainty_3d(axes: Any, view: ResultView, limit: float) -> None:
 
 
 def uncertainty_handles(view: ResultView) -> list[Any]:
-    """Return the legend entries of the cone and of the worst normals with the half-width of Λ_c along them."""
+    """Return legend entries for the cone and for the worst normals, with the jump per impulse along each."""
     if not _cones(view):
         return []
     cone = f"cone of {view.objective.normal_cone_deg:g}° about n"
@@ -237,11 +237,11 @@ def uncertainty_handles(view: ResultView) -> list[Any]:
 
 
 def _cones(view: ResultView) -> list[Array]:
-    """Return the world axes of the cones, as many as :func:`normals`; none if the normal is certain."""
+    """Return the world axes of the cones of normals: the result of :func:`normals`, or nothing without a cone."""
     return [n for _, n in normals(view.before, view.after)] if view.objective.normal_cone_deg > 0 else []
 
 
 def _worst(view: ResultView) -> list[tuple[str, WorstNormal, Array, dict[str, Any]]]:
-    """Return name, worst normals, ellipsoid and line of each posture that has worst normals."""
+    """Return name, worst normals, ellipsoid and line style for each posture that has worst normals."""
     states = zip(("before", "after"), view.worst, (view.before, view.after), (WORST_BEFORE, WORST_AFTER), strict=True)
     return [(word, worst, at.ellipsoid, line) for word, worst, at, line in states if worst is not None]

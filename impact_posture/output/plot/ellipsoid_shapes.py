@@ -9,19 +9,22 @@ import numpy as np
 from impact_posture.robot.support_polygon import convex_ring
 from impact_posture.system.arrays import Array
 
-# A direction within 1° of a plane is treated as in the plane, because its half-width differs by less than 2e-4.
+# A direction within 1° of a plane counts as in the plane.  The relative error of its half-width is below 2e-4.
 IN_PLANE = float(np.cos(np.radians(1.0)))
-# A semi-axis below this share of the longest is a rounding error, or too short to be seen.
+# A semi-axis shorter than this share of the longest semi-axis is a rounding error, or too short to be visible.
 _NEGLIGIBLE = 1e-6
-# Directions in which :func:`outline` looks for extreme points, shape (16, 2).
+# Directions in which :func:`outline` searches for extreme points, shape (16, 2).
 _AROUND = np.array([[np.cos(angle), np.sin(angle)] for angle in np.arange(16) * np.pi / 8])
 
 
 @dataclass(frozen=True, eq=False)
 class Plane:
-    """A picture plane, with the names of its axes.
+    """Plane on which figures project points.
 
-    The rows of ``axes``, shape (2, 3), are the orthonormal world directions drawn to the right and up.
+    Attributes:
+        axes: Orthonormal world directions, drawn to the right (first row) and up (second row), shape (2, 3).
+        right: Name of the first axis.
+        up: Name of the second axis.
     """
 
     axes: Array
@@ -30,11 +33,11 @@ class Plane:
 
     @property
     def name(self) -> str:
-        """``xy`` and the like."""
+        """Name of the plane, such as ``xy``."""
         return f"{self.right}{self.up}" if len(self.right + self.up) == 2 else "plane of n and z"
 
     def contains(self, direction: Array) -> bool:
-        """Return whether a unit direction lies in the plane, up to a degree."""
+        """Return whether the angle between a unit direction and the plane is at most 1°."""
         return bool(np.linalg.norm(self.axes @ direction) >= IN_PLANE)
 
 
@@ -46,7 +49,7 @@ COORDINATE_PLANES = (XY, XZ, YZ)
 
 
 def upright_plane(n: Array) -> Plane:
-    """Return the plane of the vertical and a unit vector that is not vertical."""
+    """Return the plane through the vertical axis and the unit vector ``n``, which is not vertical."""
     across = np.array([n[0], n[1], 0.0]) / np.hypot(n[0], n[1])
     name = f"along ({across[0]:.2f}, {across[1]:.2f}, 0)".replace("-", "−")
     return Plane(np.array([across, _Z]), name, "z")
@@ -59,7 +62,10 @@ def root(matrix: Array) -> Array:
 
 
 def half_width(matrix: Array, direction: Array) -> float:
-    """Return the half-width ``√(dᵀΛd)`` of ``{x: xᵀΛ⁻¹x ≤ 1}`` along a unit ``d``: half the gap of tangent planes."""
+    """Return the half-width ``√(dᵀΛd)`` of ``{x: xᵀΛ⁻¹x ≤ 1}`` along a unit vector ``d``.
+
+    It is half the distance between the two tangent planes that are perpendicular to ``d``.
+    """
     return float(np.sqrt(max(float(direction @ matrix @ direction), 0.0)))
 
 
@@ -80,11 +86,14 @@ def surface(matrix: Array, rings: int = 25) -> Array:
 
 
 def principal_sections(matrix: Array, points: int = 121) -> list[Array]:
-    """Return the ellipses through two principal axes each, shape (3, points), without ellipses that are points."""
+    """Return the sections of an ellipsoid through pairs of principal axes, shape (3, points) each.
+
+    Sections that are points are left out.
+    """
     axes = _semi_axes(matrix)
     flat = _NEGLIGIBLE * np.linalg.norm(axes[:, 2])
     pairs = [pair for pair in ([0, 1], [0, 2], [1, 2]) if np.linalg.norm(axes[:, pair[1]]) > flat]
-    # The two long sections of a rod are the same segment.
+    # If the ellipsoid is a segment, two of its sections are the same segment.
     pairs = pairs[1:] if len(pairs) == 2 and np.linalg.norm(axes[:, 1]) <= flat else pairs
     return [_ring(axes[:, pair], points) for pair in pairs]
 
@@ -98,7 +107,7 @@ def _semi_axes(matrix: Array) -> Array:
 def _ring(axes: Array, points: int) -> Array:
     """Return the ellipse with two semi-axes (columns, the longer last); a segment if the shorter is negligible."""
     angle = np.linspace(0.0, 2 * np.pi, points)
-    # A segment is drawn once: there and back, the dashes of a line would fill its gaps.
+    # A segment is drawn in one direction only, because a second pass would fill the gaps of dashed lines.
     if np.linalg.norm(axes[:, 0]) <= _NEGLIGIBLE * np.linalg.norm(axes[:, 1]):
         angle = np.linspace(0.0, np.pi, points)
         return np.asarray(axes[:, 1:] * np.cos(angle))
@@ -106,10 +115,11 @@ def _ring(axes: Array, points: int) -> Array:
 
 
 def polar(matrix: Array, infinite: float) -> tuple[Array, Array]:
-    """Return the matrix of the polar dual ``{f: fᵀAf ≤ 1}`` of ``{x: xᵀA⁻¹x ≤ 1}``, and its unbounded directions.
+    """Return the matrix ``A⁻¹`` of the ellipsoid ``{f: fᵀAf ≤ 1}``, and its unbounded directions.
 
-    ``A`` is positive semidefinite, shape (3, 3).  The result is ``A⁻¹`` with these directions cut at the half-length
-    ``infinite``, and the directions as columns, shape (3, k).
+    ``A`` is positive semidefinite, shape (3, 3).  The ellipsoid is the polar dual of ``{x: xᵀA⁻¹x ≤ 1}``.  It is
+    unbounded in the null space of ``A``.  There, the returned matrix has the half-length ``infinite``.  The unbounded
+    directions are columns, shape (3, k).
     """
     values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
     bounded = values > 1e-10 * max(float(values[-1]), 1e-300)
@@ -118,7 +128,10 @@ def polar(matrix: Array, infinite: float) -> tuple[Array, Array]:
 
 
 def cone_rim(axis: Array, degrees: float, length: float, points: int = 73) -> Array:
-    """Return the closed circle of points at ``length`` and ``degrees`` from a unit ``axis``, shape (3, points)."""
+    """Return the rim of a cone around a unit ``axis``: a closed circle, shape (3, points).
+
+    ``degrees`` is the angle from the axis, and ``length`` is the distance from the apex, which is the origin.
+    """
     across = np.linalg.svd(axis[None])[2][1:]
     angle, tilt = np.linspace(0.0, 2 * np.pi, points), np.radians(degrees)
     around = across.T @ np.array([np.cos(angle), np.sin(angle)])
@@ -135,7 +148,7 @@ def outline(points: Array) -> Array:
     extreme = points[:, (_AROUND @ points).argmax(axis=1)]
     steps = np.roll(extreme, -1, axis=1) - extreme
     sides = np.flatnonzero(steps.any(axis=0))
-    # Most points are inside the polygon of the extreme points and cannot be corners.
+    # Remove the points inside the polygon of the extreme points, because they cannot be corners of the hull.
     dx, dy = points[:, None] - extreme[:, sides, None]
     left = steps[0, sides, None] * dy - steps[1, sides, None] * dx
     points = points[:, (left <= 0).any(axis=0) | (sides.size == 0)]
@@ -145,7 +158,7 @@ def outline(points: Array) -> Array:
 
 def square(center: Array, n: Array, side: float) -> Array:
     """Return the corners of a square perpendicular to the unit vector ``n``, closed, shape (3, 5)."""
-    # The edges follow the world axis that n is farthest from.
+    # One edge follows the projection of the world axis that is most perpendicular to n.
     first = np.eye(3)[int(np.argmin(np.abs(n)))]
     first = first - (first @ n) * n
     first = first / np.linalg.norm(first)

@@ -1,4 +1,4 @@
-"""Figure ``jump``: the velocity jump Δν by joint, before and after, per impulse and for an approach."""
+"""Figure ``jump``: the velocity jump Δν of each joint before and after, per impulse and at the approach speed."""
 
 from __future__ import annotations
 
@@ -23,10 +23,9 @@ _ROW = 0.17
 def jump_figure(view: ResultView) -> Figure:
     """Draw Δν as horizontal bars, per impulse and for the approach speed v.
 
-    The left column shows ``a = M⁻¹Jᵀn`` per N·s, the right column ``a(1+e)v/G``.
-
-    Linear and angular velocities of the base, turning joints and sliding joints have separate panels.  Diamonds on
-    the right show the jump with the friction of the contact, if it is defined.
+    The left column shows ``a = M⁻¹Jᵀn`` per N·s.  The right column shows ``a(1+e)v/G``, and as diamonds the jump with
+    friction, if it is defined.  Linear and angular velocities of the base, turning joints and sliding joints have
+    separate panels.
     """
     groups = groups_of(view)
     gain = (1 + view.restitution) * view.speed
@@ -94,7 +93,7 @@ def _bars(axes: Any, jumps: list[Array], points: list[Array | None]) -> None:
 
 def _norms(view: ResultView, name: str, gain: float) -> str:
     first, last = (number(gain * float(np.sqrt(max(getattr(at, name), 0.0)))) for at in (view.before, view.after))
-    # The narrower title names the unit of both columns.
+    # Only the shorter of the two titles has space for the unit.
     factor, unit = ("", f" {jump_unit(view)}") if gain == 1 else (f"{gain:g} m/s · ", "")
     return f"‖Δν‖ = {factor}√{name} = {first} → {last}{unit}"
 

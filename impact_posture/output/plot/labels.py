@@ -1,4 +1,4 @@
-"""Letters beside points, each at the nearest free place around its point."""
+"""Place the letters that name points in a figure where they cover no lines."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from numpy.typing import NDArray
 from impact_posture.output.plot.ellipsoid_shapes import Plane
 from impact_posture.system.arrays import Array
 
-# Distances of a letter from its point (in points), directions to try (rad), and smallest distance of a letter from
-# lines (in points).
+# Distances of a letter from its position (in points, 1/72 inch), directions to try (rad), and smallest distance of a
+# letter from lines (in points).
 _GAPS = (2.0, 5.0, 9.0, 14.0, 20.0, 27.0, 36.0)
 _ANGLES = np.linspace(0.0, 2 * np.pi, 24, endpoint=False)
 _CLEAR = 1.4
-# Grids are lighter than ink, 0 (black) to 255. Thin lines between two pixels are gray.
+# Pixels darker than this, 0 (black) to 255, count as lines.  The limit includes thin gray lines, but not grids.
 _INK = 205
 
 
 class Label(Annotation):
-    """A letter beside a point, shape (2,) or (3,) in data coordinates, preferably in the direction ``toward``.
+    """Letter next to ``point``, shape (2,) or (3,) in data coordinates, preferably in the direction ``toward``.
 
-    :func:`draw_with_labels` finds the place.
+    :func:`draw_with_labels` determines its position.
     """
 
     def __init__(
@@ -38,7 +38,7 @@ class Label(Annotation):
         )  # fmt: skip
         self.point = np.asarray(point, dtype=float)
         self.toward = toward
-        # The layout ignores letters, because their places are not known yet.
+        # Letters get their positions after the layout, so the layout must ignore them.
         self.set_in_layout(False)
 
 
@@ -49,7 +49,7 @@ def draw_arrow(axes: Any, tail: Array, tip: Array, zorder: float, **look: Any) -
 
 
 def draw_end_on(axes: Any, name: str, plane: Plane, n: Array, at: Array, color: str = "black") -> None:
-    """Draw a normal of the picture plane as a dot (towards the reader) or a cross (away) in a ring."""
+    """Draw a normal that is perpendicular to the plane: a dot in a ring (towards the reader) or a cross (away)."""
     toward = float(np.cross(plane.axes[0], plane.axes[1]) @ n)
     look = {"linestyle": "", "markeredgecolor": color, "zorder": 6.5}
     axes.plot(*at[:, None], marker="o", markersize=8, markerfacecolor="white", markeredgewidth=1, **look)
@@ -58,15 +58,15 @@ def draw_end_on(axes: Any, name: str, plane: Plane, n: Array, at: Array, color: 
 
 
 def draw_with_labels(figure: Figure) -> FigureCanvasAgg:
-    """Draw a figure after its layout, with its letters at free places; return the image."""
+    """Draw a figure after its layout, with its letters where they cover no lines; return the image."""
     labels = [(axes, text) for axes in figure.axes for text in axes.texts if isinstance(text, Label)]
     for _, label in labels:
         label.set_visible(False)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
-    # Rows of the image count from the top. Grids and faint fills are lighter than ink.
+    # The first row of the image is the top, but coordinates count from the bottom.
     image = np.asarray(canvas.buffer_rgba())[::-1] if labels else np.zeros((0, 0, 4), np.uint8)
-    # `min` over the last axis takes five times as long.
+    # Two calls of np.minimum take a fifth of the time of ``min`` over the last axis.
     ink = np.minimum(np.minimum(image[..., 0], image[..., 1]), image[..., 2]) < _INK
     for axes, label in labels:
         label.set_visible(True)
@@ -76,7 +76,7 @@ def draw_with_labels(figure: Figure) -> FigureCanvasAgg:
 
 
 def _place(axes: Any, label: Label, ink: NDArray[np.bool_]) -> None:
-    """Move a letter to the best place, and mark the place in ``ink``, shape (height, width), lowest row first."""
+    """Move a letter to the best position, and mark its pixels in ``ink``, shape (height, width), lowest row first."""
     point = label.point
     if len(point) == 3:
         point = np.array(proj3d.proj_transform(*point, axes.get_proj())[:2])

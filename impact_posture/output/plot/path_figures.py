@@ -1,4 +1,4 @@
-"""Figures ``nullspace``, ``path`` and ``tradeoff``: along a path, over its time, and over the distance moved."""
+"""Figures ``nullspace`` (over path length), ``path`` (over time) and ``tradeoff`` (over distance or peak force)."""
 
 from __future__ import annotations
 
@@ -36,11 +36,9 @@ _KNEE = (
     "At the knee, the share of the gain exceeds the share of the {} most. It is marked only if the excess is 1/3 or "
     "more (a parabola reaches 1/4)."
 )
-
-
-# An axis is logarithmic if the ratio of the largest to the smallest value is above this.
+# An axis is logarithmic if the ratio of the largest to the smallest value exceeds this number.
 _SPREAD = 30.0
-# Upright line at a posture.
+# Style of the vertical line at a posture.
 _MARK: dict[str, Any] = {"color": INK, "linewidth": 0.8, "linestyle": ":", "zorder": 1}
 QUANTITIES: dict[str, dict[str, Any]] = {
     "H": {"color": BLUE, "linestyle": "-", "linewidth": 1.9, "marker": "o"},
@@ -51,10 +49,10 @@ QUANTITIES: dict[str, dict[str, Any]] = {
 
 
 def path_figure(view: ResultView) -> Figure:
-    """Draw H, G, V and S along ``view.path``, each divided by its value at the start; log axis if they spread widely.
+    """Draw H, G, V and S along ``view.path``, each quantity divided by its value at the start.
 
     Raises:
-        InputError: The view has no path, or its arrays do not fit together.
+        InputError: The view has no path, or the arrays of the path have different lengths.
     """
     path = required(view.path, "path", "nullspace", "give ResultView.path")
     sizes = {name: np.shape(getattr(path, name)) for name in ("s", *QUANTITIES)}
@@ -81,7 +79,7 @@ def path_figure(view: ResultView) -> Figure:
 
 
 def draw_shares(axes: Any, x: Array, data: NullSpacePath | TradeOffData) -> bool:
-    """Draw H, G, V and S over ``x``, each divided by its value at the start; return whether any was drawn."""
+    """Draw H, G, V and S over ``x``, each divided by its value at the start; return whether a curve was drawn."""
     drawn = {name: share for name in QUANTITIES if (share := normalized(data, name)) is not None}
     values = np.concatenate([curve[np.isfinite(curve)] for curve, _ in drawn.values()]) if drawn else np.ones(1)
     log = spreads(values)
@@ -101,27 +99,27 @@ def draw_shares(axes: Any, x: Array, data: NullSpacePath | TradeOffData) -> bool
 
 
 def spreads(values: Array, ratio: float = _SPREAD) -> bool:
-    """Return whether positive values need a log axis, because they spread by more than ``ratio``."""
+    """Return whether the largest positive value exceeds ``ratio`` times the smallest, so a log axis is useful."""
     positive = values[values > 0]
     return bool(positive.size) and float(positive.max() / positive.min()) > ratio
 
 
 def log_axis(axes: Any) -> None:
-    """Make the upright axis logarithmic, with plain numbers at few ticks."""
+    """Make the vertical axis logarithmic, with numbers at major ticks only."""
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: number(value)))
     axes.yaxis.set_minor_formatter(NullFormatter())
 
 
 def normalized(data: NullSpacePath | TradeOffData, name: str) -> tuple[Array, float] | None:
-    """Return a quantity divided by its first finite value, and this value; ``None`` if it is zero or undefined."""
+    """Return a quantity divided by its first finite value, and this value; ``None`` if this value is not positive."""
     values = np.asarray(getattr(data, name), dtype=float)
     first = next(iter(values[np.isfinite(values)]), 0.0)
     return (values / first, float(first)) if first > 0 else None
 
 
 def share_notes(where: str, data: NullSpacePath | TradeOffData) -> str:
-    """Return the note on the curves of :func:`draw_shares`."""
+    """Return the note that explains the curves of :func:`draw_shares`."""
     notes = "Each curve is divided by its value at the start; for H, V and S less is better. G is 1/effective mass."
     missing = [name for name in QUANTITIES if normalized(data, name) is None]
     if "S" in missing:
@@ -138,7 +136,7 @@ _EXTRA = {"distance": "distance", "force": "extra force"}
 
 
 def tradeoff_figure(view: ResultView) -> Figure:
-    """Draw the objective over the distance (log axis if it spreads widely), and below it H, G, V and S."""
+    """Draw the objective over the bound on distance or force, and below it H, G, V and S."""
     data = required(view.tradeoff, "trade-off", "tradeoff", "run optimize again with `tradeoff`")
     knee = [_KNEE.format(_EXTRA[data.against])] if data.knee is not None else []
     notes = [NOTES[data.against] + _LINES, *knee, share_notes("at these postures", data)]
@@ -193,7 +191,7 @@ def _objective(axes: Any, data: TradeOffData, view: ResultView) -> None:
 
 
 def _title(data: TradeOffData) -> str:
-    """Return a line on the gain at the knee, or else at half of the price."""
+    """Return the title: the gain at the knee, or without a knee the gain at half of the distance or extra force."""
     y, x = data.objective, data.within - data.within[0]
     gain = float(y[0] - y[-1])
     if not gain > 0:
@@ -205,7 +203,7 @@ def _title(data: TradeOffData) -> str:
     return f"half of the {_EXTRA[data.against]} yields {100 * (y[0] - half) / gain:.0f} % of the gain; no knee"
 
 
-# Number of joints that get a color and a name: the joints that move most.  The other joints are gray.
+# This number of joints, those that move most, have a color and a name.  Other joints are gray.
 _NAMED = 8
 # Joints that move less are not drawn, rad or m.
 _MOVES = 1e-4
@@ -214,7 +212,7 @@ _SHARES: dict[str, dict[str, Any]] = {
     "torque": {"color": VERMILLION, "linestyle": (0, (5, 2))},
     "thrust": {"color": GREEN, "linestyle": (0, (1, 1))},
 }
-# Names of the integrated velocities of the base.
+# Names of the base motions, by the first letter of the velocity.
 _MOVED = {"v": "base along ", "w": "base about "}
 _LEAST = "Torques, thrusts and forces on the feet that are not determined are chosen for the least largest share."
 _NOTES = {
@@ -225,14 +223,14 @@ _NOTES = {
 
 
 def motion_figure(view: ResultView) -> Figure:
-    """Draw how far each joint has moved, the objective, and the shares of the limits over time."""
+    """Draw over time how far each joint has moved, the objective, and each velocity, torque and thrust / limit."""
     motion = required(view.motion, "motion", "path", "run optimize again with `path`")
     use = required(motion.use, "motion", "path", "run optimize again with `path`")
     notes = [_NOTES.get(motion.timing, "")]
     notes += [f"Note: {motion.reason}."] if motion.reason else []
     with framed(*header_lines(view), 6.2, notes) as (figure, body):
         joints, objective, shares = body.subplots(3, 1, sharex=True, height_ratios=[1.4, 1, 1])
-        # Unlike angles, the integral of the velocities has no jump at a full turn.
+        # The integral of the velocity is continuous.  An angle would jump after a full turn.
         steps = np.diff(motion.t)[:, None] * (motion.v[1:] + motion.v[:-1]) / 2
         moved = np.vstack([np.zeros_like(motion.v[:1]), np.cumsum(steps, axis=0)])
         span = np.ptp(moved, axis=0)

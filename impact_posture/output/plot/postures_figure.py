@@ -38,20 +38,22 @@ _PUSHED = "n is the direction of the impulse on the robot, which strikes no surf
 _BEHIND = "If the contact link reaches beyond the contact point, the surface is drawn behind the link."
 _BODY = "The body is the box between the hips, of no true height."
 HATCH = "/////"
-# 3-D axes always give areas a drawing order from 3 upwards.
+# 3-D axes draw areas with a zorder of 3 or more.  This offset draws lines and markers in front of the areas.
 _FRONT = 50.0
 
 
 @dataclass(frozen=True, eq=False)
 class DrawnSurface:
-    """A contact plane, drawn as a square of ``side`` (m) with an arrow for its unit normal, shape (3,).
+    """Contact plane, drawn as a square with an arrow for its normal.
 
     Attributes:
-        point: Middle of the plane, shape (3,).
+        point: Center of the square, shape (3,).
+        normal: Unit normal, shape (3,).
+        side: Side of the square, m.
         contact: Tail of the arrow, shape (3,).
         reach: Length of the arrow, m.
-        name: Name of the arrow.
-        color: Color of the posture; gray for a plane of both postures.
+        name: Letters next to the arrow.
+        color: Color of the posture; gray for a plane that both postures share.
     """
 
     point: Array
@@ -64,26 +66,26 @@ class DrawnSurface:
 
     @property
     def tip(self) -> Array:
-        """Tip of the arrow n, shape (3,)."""
+        """Tip of the arrow, shape (3,)."""
         return np.asarray(self.contact + self.reach * self.normal)
 
     @property
     def ink(self) -> str:
-        """Color of lines; black for a plane of both postures."""
+        """Color of lines; black for a plane that both postures share."""
         return INK if self.color == GRAY else self.color
 
     def outline(self, plane: Plane) -> Array:
-        """Return the corners of the hatched strip behind the plane as seen from the side, shape (4, 2)."""
+        """Return the corners of the hatched strip behind the contact plane in the side view, shape (4, 2)."""
         middle, n = plane.axes @ self.point, plane.axes @ self.normal
         along, deep = np.array([-n[1], n[0]]) * self.side / 2, -0.22 * self.side * n
         return np.array([middle + along, middle - along, middle - along + deep, middle + along + deep])
 
 
 def postures_figure(view: ResultView) -> Figure:
-    """Draw both postures in the same axes: in 3-D, and from the side that shows n and most of the motion.
+    """Draw both postures in 3-D, and in a side view that shows n and most of the motion.
 
-    The axes are equal, in meters.  A contact plane is a square in 3-D, and a hatched edge from the side.  If the
-    contact plane moves or turns, both planes are drawn.
+    A contact plane is a square in 3-D, and a hatched edge in the side view.  If the contact plane moves or turns, it
+    is drawn for both postures.
     """
     first, second = (
         build_skeleton(view.robot, q, view.objective.contacts, view.objective.supports, collisions)
@@ -104,7 +106,7 @@ def postures_figure(view: ResultView) -> Figure:
         space, flat = body.add_subplot(grid[0, 0], axes_class=Space), body.add_subplot(grid[0, 1])
         every = np.vstack([points, *[np.vstack([square(s.point, s.normal, s.side).T, s.tip]) for s in surfaces]])
         size, middle = np.ptp(every, axis=0), (every.min(axis=0) + every.max(axis=0)) / 2
-        # The box of a planar robot keeps some depth.
+        # The box must not be flat, even if the robot is planar.
         half = np.maximum(0.54 * size, 0.2 * float(size.max()))
         frame_space(space, middle - half, middle + half, "m", 5, azimuth=-60)
         for surface in surfaces:
@@ -121,21 +123,24 @@ def postures_figure(view: ResultView) -> Figure:
 
 
 def stick_notes(state: Skeleton) -> list[str]:
-    """Return the notes on sticks and body."""
+    """Return the sentences below the figure that explain sticks, shapes and body."""
     if state.hulls:
         return [STICKS, NOTE]
     return [f"{STICKS} {_NO_SHAPES}", *([_BODY] if len(state.body) else [])]
 
 
 def side_plane(first: Skeleton, second: Skeleton) -> Plane:
-    """Return the coordinate plane that contains n and shows most of the motion; else the upright plane of n."""
+    """Return the coordinate plane that contains n and shows most of the motion.
+
+    If no coordinate plane contains n, return the upright plane through n.
+    """
     n = second.normal
     candidates = [plane for plane in (XZ, YZ, XY) if plane.contains(n)]
     if not candidates:
         return upright_plane(n)
     motion = second.points - first.points
     size = second.points - second.points.mean(axis=0)
-    # A planar robot would be seen edge-on from within its plane.
+    # Exclude side views in which a planar robot would be a line.
     if second.across is not None:
         candidates = [plane for plane in candidates if not plane.contains(second.across)] or candidates
 
@@ -151,7 +156,10 @@ def side_plane(first: Skeleton, second: Skeleton) -> Plane:
 def surfaces_of(
     first: Skeleton, second: Skeleton, letters: list[str], side: float, depths: Sequence[float] = ()
 ) -> list[DrawnSurface]:
-    """Return the planes of each contact at their depths; two planes if the contact moves along n or n turns."""
+    """Return the contact planes, ``depths`` (m) behind the contact points.
+
+    A contact has two planes, one for each posture, if it moves along n or if n turns.
+    """
     surfaces = []
     depths = depths or [0.0] * len(letters)
     pairs = zip(first.contacts, second.contacts, first.normals, second.normals, letters, depths, strict=True)
@@ -159,7 +167,7 @@ def surfaces_of(
         below, above = before - depth * n_before, after - depth * n_after
         step, turned = after - before, float(np.linalg.norm(n_before - n_after)) > 0.01
         if not turned and abs(float(step @ n_after)) < 0.03 * side:
-            # The same surface, touched at another place, is wide enough for both places.
+            # The contact moved along the same surface, so draw the surface below both contact points.
             wide = side + float(np.linalg.norm(step))
             surfaces.append(DrawnSurface((below + above) / 2, n_after, wide, after, 0.8 * side, f"n{letter}", GRAY))
         else:
@@ -169,7 +177,7 @@ def surfaces_of(
 
 
 def _window(states: list[Skeleton], plane: Plane, surfaces: list[DrawnSurface]) -> tuple[Array, Array]:
-    """Return the lower left and upper right corner of the side view, with a margin around all that is drawn."""
+    """Return the lower left and upper right corner of the side view, shape (2,) each."""
     drawn = [plane.axes @ state.points.T for state in states]
     for s in surfaces:
         drawn += [s.outline(plane).T, plane.axes @ s.tip[:, None]]
@@ -177,7 +185,7 @@ def _window(states: list[Skeleton], plane: Plane, surfaces: list[DrawnSurface]) 
 
 
 def padded(low: Array, high: Array) -> tuple[Array, Array]:
-    """Return the corners of a picture with a margin and a shorter side of at least 0.6 of the longer side."""
+    """Add a margin to a window with the corners ``low`` and ``high``.  Widen the window if it is too narrow."""
     longest = float((high - low).max()) or 1.0
     middle, half = (low + high) / 2, np.maximum(high - low, 0.6 * longest) / 2 + 0.05 * longest
     return middle - half, middle + half
@@ -191,21 +199,21 @@ def frame_flat(axes: Any, low: Array, high: Array, bins: int) -> None:
 
 
 def depth_of(plane: Plane) -> str:
-    """Return the viewing direction of a plane."""
+    """Return the direction in which the reader of a plane looks, as text."""
     if plane in COORDINATE_PLANES:
         return {"xz": "+y", "yz": "−x", "xy": "−z"}[plane.name]
     return "the horizontal across n"
 
 
 def _draw(axes: Any, points: Array, plane: Plane | None, **look: Any) -> None:
-    """Plot points of shape (3, k) in 3-D, or projected onto a plane."""
+    """Plot points of shape (3, k), projected onto ``plane``, or in 3-D if ``plane`` is ``None``."""
     if plane is None:
         look["zorder"] += _FRONT
     axes.plot(*(points if plane is None else plane.axes @ points), **look)
 
 
 def _fill(axes: Any, faces: list[Array], plane: Plane | None, color: str, zorder: float) -> None:
-    """Fill polygons of shape (3, k) faintly in 3-D, or projected onto a plane."""
+    """Fill polygons of shape (3, k), projected onto ``plane``, or in 3-D if ``plane`` is ``None``."""
     look = {"facecolor": color, "alpha": 0.1, "linewidth": 0}
     if plane is None:
         axes.add_collection3d(Poly3DCollection([face.T for face in faces], **look))
@@ -215,7 +223,7 @@ def _fill(axes: Any, faces: list[Array], plane: Plane | None, color: str, zorder
 
 
 def draw_sticks(axes: Any, state: Skeleton, line: dict[str, Any], plane: Plane | None) -> None:
-    """Draw links, shapes (or the body), rotors, joints, base, feet and contacts in 3-D, or projected onto a plane."""
+    """Draw sticks, shapes and marks of a robot, projected onto ``plane``, or in 3-D if ``plane`` is ``None``."""
     for bone in state.bones:
         _draw(axes, bone.T, plane, solid_capstyle="round", **line)
     color, thin = line["color"], line | {"linewidth": 0.8, "zorder": 2.0}
@@ -238,7 +246,7 @@ def draw_sticks(axes: Any, state: Skeleton, line: dict[str, Any], plane: Plane |
 
 
 def _body(axes: Any, corners: Array, line: dict[str, Any], plane: Plane | None) -> None:
-    """Draw a box by its corners in 3-D, or its outline on a plane."""
+    """Draw a box with these corners, shape (8, 3), in 3-D, or its outline on ``plane``."""
     if plane is not None:
         around = outline(plane.axes @ corners.T)
         axes.fill(*around, facecolor=line["color"], alpha=0.12, linewidth=0, zorder=1.5)
@@ -275,7 +283,7 @@ def _plane_2d(axes: Any, surface: DrawnSurface, plane: Plane, *, matter: bool) -
 
 
 def robot_handles(state: Skeleton, lines: dict[str, dict[str, Any]], color: str) -> list[Any]:
-    """Return the legend entries of sticks: lines by name, and the marks of base, contact points and feet."""
+    """Return the legend entries for ``lines`` (name → line style), and for base, contact points and feet."""
     marks: list[tuple[str, dict[str, Any]]] = [
         ("base", {"marker": "P", "markersize": 7}),
         ("contact point", {"marker": "o", "markersize": 5.5}),

@@ -1,4 +1,4 @@
-"""Data of the figures of a result: an impact, two postures, an approach, the path and the trade-off between them."""
+"""Data for the figures of a result, and texts that several figures share."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 _Data = TypeVar("_Data")
 
 ALONE = "numbers and ellipsoids"
-"""Begin of the fact that names the contact of the figures, if there are several contacts."""
+"""First words of the header text that names the contact in the figures, if there are several contacts."""
 
 SEPARATOR = "  ·  "
 """Separator of the facts in a header line."""
@@ -41,15 +41,15 @@ _UNITS = {"H": "‖Δν‖²/(N·s)²", "G": "1/kg", "V": "‖Δν‖²/(m/s)²"
 
 @dataclass(frozen=True, eq=False)
 class TradeOffData:
-    """The best posture within each distance from the initial posture, or within each peak force.
+    """Best postures for increasing bounds on the distance from the initial posture, or on the peak force.
 
-    The initial posture comes first.  Arrays have the shape (k,).  S is NaN where it does not exist.
+    Arrays have the shape (k,).  The first entry belongs to the initial posture.  S is NaN if it is undefined.
 
     Attributes:
-        within: Bounds on the distance (rad mixed with m) or force (N), increasing.
+        within: Bounds on the distance (rad mixed with m) or on the force (N), increasing.
         certified: Whether the certificate of each posture holds.
-        knee: Index of the knee, if the curve has a knee.
-        against: The bounded quantity.
+        knee: Index of the knee; ``None`` if the curve has no knee.
+        against: The bounded quantity, ``distance`` or ``force``.
     """
 
     within: Array
@@ -65,20 +65,20 @@ class TradeOffData:
 
 @dataclass(frozen=True, eq=False)
 class ResultView:
-    """Data that the figures of a result need.
+    """Data for the figures of a result.  "Before" is the initial posture, and "after" is the optimal posture.
 
     Attributes:
-        objective: Robot, contact, metric, kind and supports; its oracle gives the numbers.
-        q_initial: Posture before, shape (nq,).
-        q_optimal: Posture after, shape (nq,).
+        objective: Objective with robot, contacts, metric and supports.
+        q_initial: Initial posture, shape (nq,).
+        q_optimal: Optimal posture, shape (nq,).
         speed: Approach speed along the normal, m/s.
         restitution: Coefficient of restitution e, in [0, 1].
-        path: Quantities along the null-space path between them, if known.
-        tradeoff: The trade-off of objective against distance, if it was computed.
-        motion: The path to the optimum over time, if it was searched.
-        self_motion: The map of the self-motion manifold, if it was computed.
+        path: Quantities along the null-space path between both postures; ``None`` if unknown.
+        tradeoff: Trade-off of objective against distance or force; ``None`` if it was not computed.
+        motion: Path to the optimum over time; ``None`` if it was not searched.
+        self_motion: Map of the self-motion manifold; ``None`` if it was not computed.
         collisions: Pairs of names of colliding shapes, before and after.
-        depths: Distance of each surface behind its contact point, m; empty for none.
+        depths: Distance from each contact point to the surface behind it, m; empty without surroundings.
         pushed: Whether the robot is pushed (free contact pose) instead of striking a surface.
     """
 
@@ -112,7 +112,7 @@ class ResultView:
 
     @cached_property
     def free(self) -> tuple[ImpactQuantities, ...]:
-        """Quantities before and after without the supports; empty for a robot that has no supports."""
+        """Quantities before and after, computed without the supports; empty if there are no supports."""
         if not self.objective.supports:
             return ()
         oracle = ImpactOracle(replace(self.objective.case, supports=()))
@@ -120,7 +120,7 @@ class ResultView:
 
     @cached_property
     def worst(self) -> tuple[WorstNormal | None, WorstNormal | None]:
-        """Worst normals of the cone before and after, in the world; ``None`` without a cone or where undefined."""
+        """Worst normals of the cone before and after, world; ``None`` without a cone or if they are undefined."""
 
         def worst(q: Array) -> WorstNormal | None:
             try:
@@ -132,14 +132,14 @@ class ResultView:
         return worst(self.q_initial), worst(self.q_optimal)
 
     def jacobian(self, q: Array) -> Array:
-        """Return ``J(q)``, shape (3, nv), of the world velocity of the contact point without supports."""
+        """Return the Jacobian ``J(q)`` of the world velocity of the contact point, shape (3, nv)."""
         contact = self.objective.contact
         point = point_on(self.robot, contact.frame, contact.offset)
         return np.array(self.objective.oracle.numeric.at(q).jacobian(point)[:3])
 
 
 def jump_unit(view: ResultView) -> str:
-    """Return the unit of ``‖Δν‖_W`` in the metric of the view."""
+    """Return the unit of ``‖Δν‖_W``, which depends on the metric."""
     metric = view.objective.metric
     if metric.kind == "kinetic":
         return "√J"
@@ -149,7 +149,7 @@ def jump_unit(view: ResultView) -> str:
 
 
 def objective_unit(view: ResultView) -> str:
-    """Return the unit of the objective."""
+    """Return the unit of the objective, which depends on the kind of objective and the metric."""
     jump = jump_unit(view)
     square = "J" if jump == "√J" else f"({jump})²" if "/" in jump and jump[0] != "(" else f"{jump}²"
     return {"impulse": square, "energy": "kg"}.get(view.objective.kind, f"{square}/(m/s)²")
@@ -162,13 +162,13 @@ def mixed_unit(robot: Robot) -> str:
 
 
 def contact_letters(view: ResultView) -> list[str]:
-    """Return a letter for each of several contacts; an empty text for a single contact."""
+    """Return a letter for each contact (" A", " B", …), or an empty text for a single contact."""
     count = len(view.objective.contacts)
     return [f" {letter}" for letter in "ABCDEFGHIJKLMNOPQRSTUVWXYZ"[:count]] if count > 1 else [""]
 
 
 def header_lines(view: ResultView) -> tuple[str, list[str]]:
-    """Return the title and the small lines below it: robot, contact, settings, and H, G, V, S and E."""
+    """Return the title of a figure and two lines below it: the settings, and H, G, V, S and E before and after."""
     contact, metric, robot = view.objective.contact, view.objective.metric, view.robot
     named = zip(view.objective.contacts, contact_letters(view), strict=True)
     frames = ", ".join(f"{each.frame}{letter and f' ({letter.strip()})'}" for each, letter in named)
@@ -198,21 +198,21 @@ def header_lines(view: ResultView) -> tuple[str, list[str]]:
 
 
 def _worst_values(view: ResultView) -> str:
-    """Return the objective before and after if it is the worst of several impacts, else an empty text."""
+    """Return the objective before and after as text if it is a worst case over several impacts, else ``""``."""
     if isinstance(view.objective.worst_case, ImpactKind):
         return ""
     return " " + " → ".join(number(objective_value(view.objective, q)) for q in (view.q_initial, view.q_optimal))
 
 
 def required(data: _Data | None, name: str, figure: str, hint: str) -> _Data:
-    """Return the data of a figure; raise ``InputError`` if the view has none."""
+    """Return ``data``; raise ``InputError`` if it is ``None``, because a figure needs it."""
     if data is None:
         raise InputError(f"there is no {name} to draw", where=f"figure {figure}", hint=hint)
     return data
 
 
 def number(value: float | None) -> str:
-    """Format a number with three digits and a true minus sign; ``undefined`` for ``None``."""
+    """Format a number with three significant digits and the minus sign "−"; ``undefined`` for ``None`` and NaN."""
     if value is None or np.isnan(value):
         return "undefined"
     if np.isinf(value):
@@ -224,7 +224,7 @@ def number(value: float | None) -> str:
 
 
 def _short(source: str) -> str:
-    """Shorten the text that names a source: drop the explanation in parentheses and the folders."""
+    """Remove the explanation in parentheses and the folders from the name of a data source."""
     return source.split(" (")[0].rsplit("/", 1)[-1]
 
 

@@ -1,4 +1,4 @@
-"""Axes over time for figures of runs: shaded windows, limits, curves and a legend."""
+"""Draw panels over time for figures of runs: shaded windows, limits, curves and a legend."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from impact_posture.output.plot.style import GRAY, INK, framed, shared_legend
 from impact_posture.system.arrays import Array
 from impact_posture.system.escape import plot_label
 
-# Pink and light gray differ in a gray print as well.
+# These two colors also differ in a gray print.
 SHADES: dict[str, dict[str, Any]] = {
     "dwell": {"facecolor": "#f0f0f0", "edgecolor": "none", "zorder": 0.1},
     "impact": {"facecolor": "#edc3d6", "edgecolor": "none", "zorder": 0.2},
@@ -31,16 +31,17 @@ AT_LIMIT: dict[str, Any] = {
     "markeredgewidth": 0.4, "zorder": 5,
 }  # fmt: skip
 BAND: dict[str, Any] = {"facecolor": "#dcdcdc", "edgecolor": "none", "zorder": 1.2}
-# Bins across the width of a page.
+# Number of bins across a panel.
 _BINS = 1000
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A panel at a place of a figure, with a title above it.
+    """Place of a panel in a figure, with a title above it.
 
-    ``clips`` are the stretches of time to draw of each run, by the index of the run.  ``frame`` is the index of the
-    run whose windows are shaded, and the stretch of time of the axis.
+    Attributes:
+        clips: Index of a run → time interval in which the run is drawn.
+        frame: Index of the run whose windows are shaded, and the time interval of the axis.
     """
 
     panel: Panel
@@ -50,7 +51,7 @@ class Cell:
 
     @classmethod
     def of(cls, panel: Panel, which: int, clip: Clip, title: str = "") -> Cell:
-        """Return the cell of a single run."""
+        """Return a cell that shows a single run."""
         return cls(panel, {which: clip}, (which, clip), title)
 
 
@@ -64,11 +65,11 @@ def time_figure(
     title_at: str = "center",
     air: float = 0.75,
 ) -> Figure:
-    """Draw rows of cells with the header of the runs above and the legend beside them; ``None`` leaves a place blank.
+    """Draw rows of cells with a header above and the legend beside them.  The place of a ``None`` stays empty.
 
-    Cells of the same panel share their upright axis.  Cells of a column with the same axis of time name it once.
-    ``height`` of a row and additional ``air`` are in inches.  ``widths`` are ratios of the columns, and ``notes`` are
-    sentences below the figure.  Titles stand at ``center`` or ``left``.
+    Cells with the same panel share the limits of their vertical axes.  If cells of a column have the same time axis,
+    only the lowest cell has a label.  ``height`` of a row and additional ``air`` are in inches.  ``widths`` are
+    ratios of the columns.  ``notes`` are sentences below the figure.  ``title_at`` is ``center`` or ``left``.
     """
     columns = len(cells[0])
     shown: dict[Panel, list[Any]] = {}
@@ -103,9 +104,7 @@ def time_figure(
 
 
 def _draw(axes: Any, cell: Cell, views: Sequence[RunView]) -> None:
-    """Draw the shaded windows, limits and curves of a cell."""
     panel, (shown, frame) = cell.panel, cell.frame
-    # Impacts are shaded over dwells.
     for kind, shade in SHADES.items():
         for window in views[shown].windows:
             if window.kind == kind and window.end > frame.begin and window.begin < frame.end:
@@ -121,10 +120,10 @@ def _draw(axes: Any, cell: Cell, views: Sequence[RunView]) -> None:
             _band(axes, view, panel.ranges[which], clip)
         for k, values in enumerate(panel.values[which].T):
             looks, entry = (RUNS, which) if panel.overlay else (LINES, k)
-            # Dashes of a noisy curve would run together.
+            # Noisy curves are solid, because the gaps of dashed lines would not be visible.
             look = looks[entry % len(looks)] | ({"linestyle": "-", "linewidth": 0.7} if panel.noisy else {})
             name = panel.names[entry] if panel.names else ""
-            # A curve is straight across gaps (NaN).
+            # Without NaN, the curve is a straight line across gaps.
             inside = (view.t >= clip.begin) & (view.t <= clip.end) & np.isfinite(values)
             label = plot_label(name) if name else None
             axes.plot(clip.x(view.t[inside]), values[inside], label=label, **look)
@@ -140,14 +139,14 @@ def _saturation(axes: Any, panel: Panel, which: int, view: RunView, clip: Clip) 
     """Mark the ticks with a command at a limit, because a single tick is too short to be seen."""
     for limit, flags in zip(panel.limits, panel.saturated(which), strict=True):
         times = view.t[flags & (view.t >= clip.begin) & (view.t <= clip.end)]
-        # Closer marks would cover each other.
+        # Draw at most one mark per interval of time, because closer marks would cover each other.
         places = np.floor(_BINS / 8 * (times - clip.begin) / (clip.end - clip.begin))
         seen = times[np.unique(places, return_index=True)[1]]
         axes.plot(clip.x(seen), np.full(len(seen), limit), **AT_LIMIT)
 
 
 def _band(axes: Any, view: RunView, bounds: Array, clip: Clip) -> None:
-    """Fill between the lowest lower bound and the highest upper bound of each bin of ticks."""
+    """Fill between the smallest lower bound and the largest upper bound in each bin of ticks."""
     inside = (view.t >= clip.begin) & (view.t <= clip.end)
     t, bounds = view.t[inside], bounds[inside]
     starts = np.arange(0, len(t), max(len(t) // _BINS, 1))
@@ -156,7 +155,7 @@ def _band(axes: Any, view: RunView, bounds: Array, clip: Clip) -> None:
 
 
 def _scale_metric(axes: Any, values: Sequence[Array]) -> None:
-    """Make the axis of H logarithmic if H spans more than a decade; else let it begin at zero."""
+    """Make the axis of H logarithmic if H varies by more than a factor of 10; otherwise start it at zero."""
     every = np.concatenate([value[np.isfinite(value)] for value in values])
     if every.size and (every > 0).all() and spreads(every, 10.0):
         log_axis(axes)
@@ -186,10 +185,10 @@ def _common_handles(views: Sequence[RunView], panels: Sequence[Panel]) -> list[A
 
 
 def _legend(body: Any, shared: Sequence[Any], named: Sequence[tuple[str, Any]]) -> None:
-    """Put the legend right of the panels of ``body``, or below them if no curve has a name.
+    """Put the legend to the right of the panels, or below them if no curve has a name.
 
-    ``shared`` are entries of all panels, and ``named`` headings with the axes of their curves.  A single group of
-    curves gets no heading.
+    ``shared`` are entries for all panels.  ``named`` are pairs of a heading and the axes with the curves below this
+    heading.  The heading is omitted if only one of the axes has named curves.
     """
     groups = [(what, handles) for what, axes in named if (handles := axes.get_legend_handles_labels()[0])]
     if not groups:

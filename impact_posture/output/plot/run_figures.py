@@ -1,4 +1,4 @@
-"""Figures of runs over time: the metric, the commands and the joints, of a single run or of several controllers."""
+"""Figures of runs over time: metric, commands and joints, for one run or for several controllers."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ from impact_posture.system.escape import plot_label
 
 HINT = "Less H is better: it is the squared velocity jump of an impulse of 1 N·s along n."
 LEFT = "Left: the whole run. Right: the first impact."
-# Controllers side by side.
+# Number of controllers in a row.
 COLUMNS = 3
-# Widths of the whole run and of the first impact beside it.
+# Ratios of the widths: whole run, first impact.
 _WIDTHS = (1.7, 1.0)
 
 
 def figures_of_run(view: RunView) -> dict[str, Figure]:
     """Return the figures of a run by name: ``metric``, ``controls``, ``joints`` and ``snapshots``.
 
-    A robot without actuators has no ``controls``, a robot without joints has no ``joints``.
+    ``controls`` is missing if the robot has no actuators, and ``joints`` is missing if it has no joints.
     """
     figures = {"metric": metric_figure(view)}
     if control_panels([view]):
@@ -48,7 +48,7 @@ def figures_of_run(view: RunView) -> dict[str, Figure]:
 def figures_of_comparison(views: Sequence[RunView]) -> dict[str, Figure]:
     """Return the figures ``comparison-metric``, ``-controls``, ``-joints`` and ``snapshots`` of several controllers.
 
-    The views are a run of each controller (of a push: with the same sign).  The nominal controller is drawn first.
+    ``views`` contains one run of each controller.  Pushes must have the same sign.
     """
     figures = {"comparison-metric": comparison_figure(views)}
     if control_panels(views):
@@ -59,21 +59,21 @@ def figures_of_comparison(views: Sequence[RunView]) -> dict[str, Figure]:
 
 
 def metric_figure(view: RunView) -> Figure:
-    """Draw H, ``‖ν‖``, the contact force, and the level of the impact-robust term where it changes, over time."""
+    """Draw H, ``‖ν‖``, the contact force, and the activation of the impact-robust term if it changes, over time."""
     panels = metric_panels(view)
     cells = [_run_and_impact(panel, 0, view) for panel in panels]
     return time_figure([view], cells, 1.25, [HINT, *_notes(panels, cells)], widths=_WIDTHS)
 
 
 def controls_figure(view: RunView) -> Figure:
-    """Draw the rotor speeds and commanded joint torques of a run with actuators, and their limits (dashed)."""
+    """Draw rotor speeds and commanded joint torques with their limits (dashed) over time."""
     panels = control_panels([view])
     cells = [_run_and_impact(panel, 0, view) for panel in panels]
     return time_figure([view], cells, 1.9, _notes(panels, cells), widths=_WIDTHS)
 
 
 def joints_figure(views: Sequence[RunView]) -> Figure:
-    """Draw the positions of joints with one degree of freedom, one row for each controller, nominal first."""
+    """Draw the positions of joints with one degree of freedom over time, with a row for each controller."""
     views = check_same(views, "figure joints")
     panels = joint_panels(views)
     cells = [_run_and_impact(panel, k, view) for k, view in enumerate(views) for panel in panels]
@@ -89,8 +89,7 @@ def joints_figure(views: Sequence[RunView]) -> Figure:
 def comparison_figure(views: Sequence[RunView]) -> Figure:
     """Draw H of all controllers over time, and below it ``‖ν‖`` around the first impact.
 
-    In the lower panel, the time is relative to the impact of each run.  For pushes, the time of the upper panel is
-    also relative to the push.
+    In the lower panel, time zero is the first impact of each run.  For pushes, this also applies to the upper panel.
     """
     views = check_same(views, "figure comparison-metric")
     spans = [_since_impact(view) for view in views]
@@ -111,7 +110,7 @@ def comparison_figure(views: Sequence[RunView]) -> Figure:
 
 
 def controls_comparison_figure(views: Sequence[RunView]) -> Figure:
-    """Draw the commands around the impacts with their limits (dashed), a column for each controller, nominal left."""
+    """Draw the commands around the impacts with their limits (dashed), in a column for each controller."""
     views = check_same(views, "figure comparison-controls")
     panels = control_panels(views)
     columns = min(len(views), COLUMNS)
@@ -126,18 +125,18 @@ def controls_comparison_figure(views: Sequence[RunView]) -> Figure:
 
 
 def _run_and_impact(panel: Panel, which: int, view: RunView) -> list[Cell]:
-    """Return the cells of the whole run and, if there is an impact, of the first impact."""
+    """Return a cell for the whole run and, if there is an impact, a cell for the first impact."""
     return [Cell.of(panel, which, clip) for clip in (whole(view), first_impact(view)) if clip is not None]
 
 
 def _notes(panels: Sequence[Panel], cells: Sequence[Sequence[Cell | None]]) -> list[str]:
-    """Return the notes of the panels, and the meaning of the columns if there are two."""
+    """Return the notes of the panels and, if there are two columns, a note on the columns."""
     left = any(cell is not None and cell.frame[1].scale != 1.0 for cell in cells[0])
     return [*dict.fromkeys(panel.note for panel in panels if panel.note), *[LEFT] * left]
 
 
 def _since_impact(view: RunView) -> Clip:
-    """Return the clip of a whole run; time counts from a push, because the robot comes to rest at another time."""
+    """Return the clip of a whole run.  Its time zero is the push, because the time before the push differs by run."""
     clip = whole(view)
     if not (view.pushed and view.impacts):
         return clip

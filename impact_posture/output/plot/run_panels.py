@@ -1,4 +1,4 @@
-"""Panels over time: stretches of time, curves and limits."""
+"""Select what a panel over time shows: time interval, curves, limits and notes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from impact_posture.system.arrays import Array
 
 # Largest number of joints in a panel.
 SHOWN = 8
-# Line styles of the curves of a panel, which differ in color and dashes.
+# Line styles for the curves of a panel.
 LINES: tuple[dict[str, Any], ...] = (
     {"color": BLUE, "linestyle": "-", "linewidth": 1.3},
     {"color": VERMILLION, "linestyle": (0, (4, 1.5)), "linewidth": 1.3},
@@ -26,19 +26,20 @@ LINES: tuple[dict[str, Any], ...] = (
     {"color": ORANGE, "linestyle": (0, (3, 1, 1, 1, 1, 1)), "linewidth": 1.3},
     {"color": GRAY, "linestyle": (0, (2, 2)), "linewidth": 1.0},
 )
-# Line styles of runs in a panel.  The first run looks like the posture before, and the second like the posture after.
+# Line styles for the runs in a panel.  The first run has the style of "before" in other figures, the second run has
+# the style of "after".
 RUNS: tuple[dict[str, Any], ...] = (LINES[1] | {"zorder": 3.5}, LINES[0] | {"linewidth": 1.6}, *LINES[2:])
-# A limit above this multiple of the largest value is named below the figure, not drawn.
+# A limit above this multiple of the largest value is not drawn.  A note below the figure states it.
 _FAR = 4.0
-# A command is treated as at a limit if its distance from the limit is at most this share of the range.
+# A command is at a limit if its distance from the limit is at most this share of the range.
 _NEAR = 1e-3
 
 
 @dataclass(frozen=True)
 class Clip:
-    """A stretch of time of a run, s.  The axis with this label shows ``scale (t − origin)``.
+    """Time interval of a run, s.  The time axis shows ``scale (t − origin)``.
 
-    ``scale`` is the number of units of the axis per second: 1, or 1000 for milliseconds.
+    ``scale`` is 1 for an axis in seconds, or 1000 for milliseconds.
     """
 
     begin: float
@@ -48,7 +49,7 @@ class Clip:
     label: str = "time  [s]"
 
     def x(self, t: Any) -> Any:
-        """Return times as the axis counts them."""
+        """Return ``scale (t − origin)``."""
         return self.scale * (t - self.origin)
 
 
@@ -58,7 +59,7 @@ def whole(view: RunView) -> Clip:
 
 
 def first_impact(view: RunView) -> Clip | None:
-    """Return the clip of the first impact window with a margin, in ms from its begin; ``None`` without impact."""
+    """Return the clip of the first impact window with a margin, in ms; ``None`` without impact."""
     if not view.impacts:
         return None
     window = view.impacts[0]
@@ -82,16 +83,16 @@ class Panel:
     """Curves over time of several runs.
 
     Attributes:
-        label: Name of the upright axis.
-        names: Names of the curves, or of the runs if they are overlaid; may be empty.
-        values: Samples of the curves of each run, shape (number of times, number of curves).
+        label: Label of the vertical axis.
+        names: Names of the curves, or names of the runs with ``overlay``; may be empty.
+        values: For each run, the samples of the curves, shape (n, curves).
         limits: Lower and upper limit of the commands, drawn as dashed lines; empty for none.
-        ranges: Lower and upper bound to shade between, for each run, shape (n, 2).
-        stopped: Whether the joint of a curve was at its stop, for each run, shape (n, curves).
+        ranges: For each run, lower and upper bound of a shaded band, shape (n, 2).
+        stopped: For each run, whether the joint of a curve was at its stop, shape (n, curves).
         note: Sentence below the figure.
-        noisy: Whether the curves carry noise, as the commands of flying robots do.
-        scale: Scale of the upright axis: ``auto``, ``from zero``, or ``metric`` (logarithmic where it spreads).
-        overlay: Whether all runs are drawn in the same panel, each with its own look.
+        noisy: Whether the curves contain noise, as the commands of flying robots.
+        scale: Scale of the vertical axis: ``auto``, ``from zero``, or ``metric`` (logarithmic if H varies strongly).
+        overlay: Whether all runs are drawn in the same panel, with different line styles.
     """
 
     label: str
@@ -106,7 +107,7 @@ class Panel:
     overlay: bool = False
 
     def saturated(self, which: int) -> list[Flags]:
-        """Return for each limit the ticks in which a command of run ``which`` was at the limit, shape (n,)."""
+        """Return for each limit whether any command of run ``which`` is at the limit, shape (n,)."""
         if not self.limits:
             return []
         commands = self.values[which] if self.ranges is None else self.ranges[which]
@@ -116,7 +117,7 @@ class Panel:
 
 
 def metric_panels(view: RunView) -> list[Panel]:
-    """Return the panels of H, ``‖ν‖``, the contact force, and the level of the impact-robust term if it changes."""
+    """Return panels for H, ``‖ν‖``, contact force, and the activation of the impact-robust term if it changes."""
     n = np.array(view.contact.normal)
     normal = view.force @ n
     if view.pushed:
@@ -133,27 +134,26 @@ def metric_panels(view: RunView) -> list[Panel]:
 
 
 def metric_panel(views: Sequence[RunView], names: Sequence[str] = ()) -> Panel:
-    """Return the panel of H of all runs."""
+    """Return a panel with H of all runs."""
     values = [view.objective[:, None] for view in views]
     return Panel("H  [‖Δν‖²/(N·s)²]", names, values, scale="metric", overlay=bool(names))
 
 
 def speed_panel(views: Sequence[RunView]) -> Panel:
-    """Return the panel of ``‖ν‖`` of all runs."""
+    """Return a panel with ``‖ν‖`` of all runs."""
     label = f"‖ν‖  [{mixed_unit(views[0].robot).strip('()')}]"
     return Panel(label, (), [view.speed[:, None] for view in views], scale="from zero", overlay=True)
 
 
 def rotor_panel(views: Sequence[RunView]) -> Panel | None:
-    """Return the panel of rotor speeds, the range of their commands, and the limits, as shares of the highest speed.
+    """Return a panel with rotor speeds divided by the highest speed; ``None`` for a robot without rotors.
 
-    Return ``None`` for a robot without rotors.  The commands carry the noise of the sensors, so single curves of them
-    could not be told apart.
+    Commands are a shaded band, because sensor noise makes their curves indistinguishable.
     """
     bounds, count = views[0].rotor_limits, views[0].rotor_command.shape[1]
     if not count:
         return None
-    # A robot.toml does not name the unit of rotor speeds.
+    # The unit of rotor speeds is unknown, because robot.toml does not state it.  So draw ratios.
     low, high = bounds or (0.0, 1.0)
     names = [f"rotor {k + 1}" for k in range(count)]
     commands = [view.rotor_command / high for view in views]
@@ -164,15 +164,15 @@ def rotor_panel(views: Sequence[RunView]) -> Panel | None:
 
 
 def control_panels(views: Sequence[RunView]) -> list[Panel]:
-    """Return the panels of the rotor and joint commands with their limits."""
+    """Return panels for the commands of rotors and joints, with their limits."""
     return [panel for panel in (rotor_panel(views), torque_panel(views)) if panel is not None]
 
 
 def torque_panel(views: Sequence[RunView]) -> Panel | None:
-    """Return the panel of commanded joint torques; ``None`` for a robot without joints.
+    """Return a panel with commanded joint torques; ``None`` for a robot without joints.
 
-    Of many joints, it shows the joints that come closest to their limits.  Torques are in N·m if all shown joints
-    have the same limit or none; else each torque is divided by the limit of its joint.
+    If there are many joints, it shows the joints that come closest to their limits.  If the shown joints have
+    different limits, each torque is divided by the limit of its joint.
     """
     first, limits = views[0], views[0].torque_limits
     if not limits.size:
@@ -207,7 +207,7 @@ def torque_panel(views: Sequence[RunView]) -> Panel | None:
 
 
 def joint_panels(views: Sequence[RunView]) -> list[Panel]:
-    """Return the panels of the joints that move most: a panel of positions in rad, and a panel of positions in m."""
+    """Return a panel with joint angles and a panel with positions of sliding joints.  Show joints that move most."""
     first = views[0]
     moved = np.max([np.ptp(view.positions, axis=0) for view in views], axis=0)
     single = np.flatnonzero(np.isfinite(moved))

@@ -1,4 +1,4 @@
-"""Data of the figures of a simulated run: the robot, the impact, and arrays with a row for each tick."""
+"""Data for the figures of a simulated run: robot, contact, and arrays with a row for each controller tick."""
 
 from __future__ import annotations
 
@@ -26,28 +26,26 @@ Flags = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class RunView:
-    """A run of a controller in a scenario, with n ticks and the states at the end of each tick.
-
-    The robot holds the limits of the commands: ``model.effortLimit`` and the rotor speeds of its propulsion.
+    """Run of a controller in a scenario, with n ticks.  States belong to the end of a tick.
 
     Attributes:
-        contact: Impact contact: frame, offset, and the world normal out of the surface (or along the push).
-        t: s, increasing, shape (n,).
+        contact: Impact contact with its frame, its offset, and the world normal out of the surface (or along a push).
+        t: Time, s, increasing, shape (n,).
         q: Configuration, shape (n, nq).
-        v: ν, shape (n, nv).
-        torque: Joint torques as commanded, N·m (N for sliding joints), shape (n, joints).
-        rotor_command: Rotor speeds as commanded, shape (n, rotors).
-        rotor_speed: Rotor speeds as measured, shape (n, rotors).
-        force: Force of the surface on the robot, or of the push, world, N, shape (n, 3).
+        v: Velocity ν, shape (n, nv).
+        torque: Commanded joint torques, N·m (N for sliding joints), shape (n, joints).
+        rotor_command: Commanded rotor speeds, shape (n, rotors).
+        rotor_speed: Measured rotor speeds, shape (n, rotors).
+        force: Force of the surface or push on the robot, world, N, shape (n, 3).
         peak: Largest normal force within each tick, N, shape (n,).
-        objective: H of the impact, shape (n,); NaN where it was not evaluated.
-        level: Level of the impact-robust term, 0 to 1, shape (n,).
+        objective: H of the impact, shape (n,); NaN if it was not evaluated.
+        level: Activation of the impact-robust term, 0 to 1, shape (n,).
         at_stop: Whether a joint is at a position limit, shape (n, nv).
-        windows: Windows of time.  Figures shade the kinds ``impact`` and ``dwell``.
-        surface: A point on the surface that is hit, world, m, shape (3,); ``None`` for a push.
-        supports: Feet that stay.
-        label: Name of the run beside others; the name of the controller if empty.
-        facts: Facts for the small print below the title, for example the seed and the sign of the push.
+        windows: Time windows.  Figures shade the kinds ``impact`` and ``dwell``.
+        surface: A point on the surface, world, m, shape (3,); ``None`` for a push.
+        supports: Feet that stay on the ground.
+        label: Name of the run in figures of several runs; empty for the name of the controller.
+        facts: Texts for the lines below the title, such as the seed and the sign of the push.
     """
 
     scenario: str
@@ -91,7 +89,7 @@ class RunView:
 
     @property
     def name(self) -> str:
-        """Name of the run beside others."""
+        """Name of the run in figures of several runs."""
         return self.label or self.controller
 
     @property
@@ -101,7 +99,7 @@ class RunView:
 
     @property
     def impacts(self) -> tuple[Window, ...]:
-        """Impact windows in the order of time."""
+        """Impact windows, sorted by time."""
         return tuple(sorted((w for w in self.windows if w.kind == "impact"), key=lambda w: w.begin))
 
     @property
@@ -126,16 +124,16 @@ class RunView:
 
     @cached_property
     def positions(self) -> Array:
-        """Position of each joint, shape (n, joints): rad (of endless joints unwrapped) or m.
+        """Position of each joint, rad or m, shape (n, joints).  Angles of continuous joints are unwrapped.
 
-        Joints of several degrees of freedom have no single position.  Their entries are NaN.
+        Entries are NaN for joints with several degrees of freedom.
         """
         model, q = self.robot.model, np.asarray(self.q)
         positions = np.full((len(self.t), self.robot.nv), np.nan)
         for joint in range(1, model.njoints):
             if int(model.nvs[joint]) == 1:
                 at, v = int(model.idx_qs[joint]), int(model.idx_vs[joint])
-                # Pinocchio stores cosine and sine of an endless joint.
+                # Pinocchio stores the cosine and sine of a continuous joint.
                 endless = int(model.nqs[joint]) == 2
                 positions[:, v] = np.unwrap(np.arctan2(q[:, at + 1], q[:, at])) if endless else q[:, at]
         return positions[:, self.first_joint :]
@@ -153,12 +151,12 @@ class RunView:
         return None if propulsion is None else (propulsion.speed_min, propulsion.speed_max)
 
     def index(self, time: float) -> int:
-        """Return the last tick that has ended by ``time`` (s), or the first tick."""
+        """Return the index of the last tick that ends at or before ``time`` (s), at least 0."""
         return max(int(np.searchsorted(self.t, time, side="right")) - 1, 0)
 
 
 def run_header(views: Sequence[RunView]) -> tuple[str, list[str]]:
-    """Return title and small print of a figure of runs of a scenario."""
+    """Return the title of a figure of runs, and the lines below the title."""
     first = views[0]
     names = ", ".join(view.name for view in views) if len(views) < 5 else f"{len(views)} controllers"
     n = ", ".join(number(value) for value in first.contact.normal)
@@ -175,9 +173,10 @@ def run_header(views: Sequence[RunView]) -> tuple[str, list[str]]:
 
 
 def check_same(views: Sequence[RunView], where: str) -> tuple[RunView, ...]:
-    """Return the views, the nominal controller first.
+    """Return the views with the nominal controller first.
 
-    Raise ``InputError`` without a view, or if views are of different scenarios or robots.
+    Raises:
+        InputError: There is no view, or the views belong to different scenarios or robots.
     """
     if not views:
         raise InputError("there is no run to draw", where=where, hint="give at least one view")
@@ -191,6 +190,6 @@ def check_same(views: Sequence[RunView], where: str) -> tuple[RunView, ...]:
         }
         for what, (value, expected) in compared.items():
             if value != expected:
-                fault = f"the {what} of {view.name} is {value}, of {first.name} {expected}"
+                fault = f"the {what} of {view.name} is {value}, but for {first.name} it is {expected}"
                 raise InputError(fault, where=where, hint="compare runs of the same scenario")
     return tuple(sorted(views, key=lambda view: view.controller != "nominal"))

@@ -1,4 +1,4 @@
-"""Figure ``self_motion``: the objective over the self-motion manifold, with one or two free motions."""
+"""Figure ``self_motion``: the objective over the self-motion manifold, if it has one or two dimensions."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 _CURVES = "Each curve is one component: it is closed, or runs from one limit to another."
 _SURFACES = "Each panel is one component, over the two joints that move most on it; sheets may lie over each other."
 _GRAY = "Gray: limits or inequalities are violated. Postures that differ by full turns count as one."
-# Largest number of surfaces, the largest first, and the gap between curves as a share of all lengths.
+# Maximum number of surfaces in the figure, and gap between curves as a share of the sum of their lengths.
 _PANELS, _GAP = 4, 0.03
 _MARKS: dict[str, dict[str, Any]] = {
     "ends": {"marker": "o", "markersize": 7, "markerfacecolor": "none", "markeredgecolor": INK, "zorder": 5},
@@ -33,7 +33,7 @@ _LABELS = {"ends": "optima of multi-start", "start": "start", "optimum": "optimu
 
 
 def self_motion_figure(view: ResultView) -> Figure:
-    """Draw the objective over the path length of each curve, or as a map of each surface."""
+    """Draw the objective over path length if the manifold is one-dimensional, otherwise as a map of each surface."""
     data = required(view.self_motion, "map", "self_motion", "run optimize again with `search` global")
     curves, known = bool(data.s.any()), np.isfinite(data.objective) & (data.objective > 0)
     y = np.where(known, data.objective, np.nan)
@@ -69,7 +69,7 @@ def _draw_curves(body: Any, data: SelfMotionMap, y: Array, label: str) -> Any:
 
 def _draw_surfaces(body: Any, data: SelfMotionMap, y: Array, label: str, view: ResultView) -> Any:
     sizes = np.bincount(data.component)
-    # The component of the optimum comes first.
+    # The component with the optimum comes first, then the component with the most points.
     order = sorted(range(len(sizes)), key=lambda k: (k != data.component[data.optimum[0]], -sizes[k]))[:_PANELS]
     panels = body.subplots(1, len(order), squeeze=False)[0]
     chart = Chart(view.robot.model)
@@ -80,7 +80,7 @@ def _draw_surfaces(body: Any, data: SelfMotionMap, y: Array, label: str, view: R
     image = None
     for axes, k in zip(panels, order, strict=True):
         mine = data.component == k
-        # The two joint coordinates with the largest spread.
+        # The axes are the two joint coordinates with the largest range.
         pair = [joints[i] for i in np.argsort(-np.ptp(x[mine][:, joints], axis=0), kind="stable")[:2]]
         for index, name in zip(pair, ("x", "y"), strict=True):
             slot = next(s for s in chart.slots if s.x.start <= index < s.x.stop)
@@ -96,7 +96,7 @@ def _draw_surfaces(body: Any, data: SelfMotionMap, y: Array, label: str, view: R
 
 
 def _mark(axes: Any, data: SelfMotionMap, x: Array, y: Array, mine: NDArray[np.bool_]) -> None:
-    """Mark the start, the optimum and the optima of the multi-start search that lie on a component."""
+    """Mark the start, the optimum and the optima of the multi-start search, if they belong to the points ``mine``."""
     for name, look in _MARKS.items():
         places = getattr(data, name)
         here = places[mine[places]]

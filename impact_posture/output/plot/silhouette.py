@@ -1,4 +1,4 @@
-"""Silhouettes of the collision shapes of a robot, behind its sticks."""
+"""Draw outlines of the collision shapes of a robot behind its sticks."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from impact_posture.system.arrays import Array
 NOTE = "Light areas show the collision shapes, each with the hull around it."
 _FILL: dict[str, Any] = {"alpha": 0.14, "linewidth": 0.3, "zorder": 1.2}
 _HIT: dict[str, Any] = {"facecolor": ORANGE, "edgecolor": ORANGE, "alpha": 0.55, "linewidth": 0.8, "zorder": 1.4}
-# A sweep smaller than this (m) is drawn with few directions, a larger sweep as round.
+# Hulls with a smaller sweep radius (m) are drawn with six directions, larger hulls with 24.
 _ROUND = 0.01
-# Least sweep drawn (m), because a point or a line has no outline.
+# Minimum sweep radius in the figure (m), because a point or a line has no outline.
 _LEAST = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class PlacedHull:
-    """A swept hull in the world: corners, shape (k, 3), and sweep radius, m, and whether it is in a collision."""
+    """Swept hull in world coordinates: vertices, shape (k, 3), sweep radius, m, and whether it is in collision."""
 
     vertices: Array
     radius: float
@@ -37,22 +37,22 @@ class PlacedHull:
 
 
 class _Silhouette(PathPatch):
-    """A patch in picture coordinates, which 3-D axes draw behind everything else."""
+    """Patch in picture coordinates.  3-D axes draw it behind everything else."""
 
     def do_3d_projection(self) -> float:
-        """Return the depth by which 3-D axes sort."""
+        """Return an infinite depth, because 3-D axes draw patches in the order of depth."""
         return float("inf")
 
 
 def place_hulls(robot: Robot, data: pin.Data, collisions: Iterable[tuple[str, str]] = ()) -> tuple[PlacedHull, ...]:
     """Place the hulls of a robot at the joint placements in ``data``.
 
-    ``collisions`` are pairs of names of shapes or bodies in a collision; other names are ignored.
+    ``collisions`` are pairs of names of colliding shapes or bodies.  Unknown names are ignored.
     """
     shapes = load_shapes(robot)
     links = {name.partition("[")[0] for pair in collisions for name in pair}
     joints = {robot.model.frames[robot.frame_id(link)].parentJoint for link in links if robot.model.existFrame(link)}
-    # A link without its own hull may be part of another hull on the same joint.
+    # The hull of a link may be merged into the hull of another link on the same joint.
     alone = {body.joint for body in shapes.bodies if body.link in links}
     return tuple(
         PlacedHull(
@@ -65,7 +65,7 @@ def place_hulls(robot: Robot, data: pin.Data, collisions: Iterable[tuple[str, st
 
 
 def draw_silhouettes(axes: Any, hulls: Iterable[PlacedHull], color: str, plane: Plane | None) -> None:
-    """Draw the outlines of hulls in 3-D, or projected onto a plane."""
+    """Draw the outlines of hulls, projected onto ``plane``, or in 3-D if ``plane`` is ``None``."""
     if plane is None:
         across, up, project = _view(axes)
     else:
@@ -78,21 +78,20 @@ def draw_silhouettes(axes: Any, hulls: Iterable[PlacedHull], color: str, plane: 
             if hull.hit is hit
         ]
         if rings:
-            # One path contains all outlines, because overlapping patches would get darker.
+            # One path contains all outlines, because separate patches would be darker where they overlap.
             patch = _Silhouette(Path.make_compound_path(*[Path(ring, closed=True) for ring in rings]), **look)
-            # The layout does not measure the path, because that is slow and the limits of the panel are known.
+            # Exclude the path from the layout, because measuring it is slow and the limits of the panel are known.
             patch.set_in_layout(False)
             axes.add_artist(patch)
 
 
 def _circle(radius: float) -> Array:
-    """Return points on a circle, shape (k, 2)."""
     angles = np.linspace(0, 2 * np.pi, 6 if radius < _ROUND else 24, endpoint=False)
     return max(radius, _LEAST) * np.array([np.cos(angles), np.sin(angles)]).T
 
 
 def _view(axes: Any) -> tuple[Array, Array, Callable[[Array], Array]]:
-    """Return the world directions to the right and up of 3-D axes, and the projection of points to their picture."""
+    """Return the world directions to the right and up in 3-D axes, and the function that projects world points."""
     azimuth, elevation = np.radians([axes.azim, axes.elev])
     across = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
     toward = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
@@ -105,6 +104,6 @@ def _view(axes: Any) -> tuple[Array, Array, Callable[[Array], Array]]:
 
 
 def silhouette_handles(hulls: Sequence[PlacedHull], color: str) -> list[Any]:
-    """Return the legend entries of shapes and of shapes in a collision."""
+    """Return the legend entries for shapes and for shapes in collision."""
     handles = [Patch(label="shapes", facecolor=color, edgecolor=color, **_FILL)] if hulls else []
     return [*handles, *([Patch(label="in collision", **_HIT)] if any(hull.hit for hull in hulls) else [])]

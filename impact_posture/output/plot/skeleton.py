@@ -1,4 +1,4 @@
-"""Sticks of a robot from its model, and the hulls of its collision shapes."""
+"""Sticks that represent a robot in figures, computed from its model, and the hulls of its collision shapes."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_spec import Support
 from impact_posture.system.arrays import Array
 
-# Least height of a body as a share of its shorter side.
+# Minimum height of the drawn body as a share of its shorter side.
 _LEAST_HEIGHT = 0.35
-# Two axes are treated as parallel if the sine of their angle is at most this.
+# Two axes count as parallel if the sine of their angle is at most this number.
 _PARALLEL = 1e-3
 _AROUND = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
 
 
 @dataclass(frozen=True, eq=False)
 class Skeleton:
-    """Sticks of a robot in a posture, in the world, m.
+    """Sticks of a robot in a posture, in world coordinates, m.
 
     Attributes:
-        bones: Pairs of points to join, shape (k, 2, 3).
+        bones: End points of the sticks, shape (k, 2, 3).
         joints: Origins of the moving joints, shape (j, 3).
-        base: Placement of the free-flyer; the identity for a fixed root.
-        body: Corners of the box between the hips, low corners first, shape (8, 3); (0, 3) without a box.
-        contacts: The contact points, shape (c, 3).
-        normals: World unit normals, shape (c, 3).
+        base: Placement of the floating base; the identity for a fixed base.
+        body: Corners of the box around the hips, low corners first, shape (8, 3); (0, 3) without a box.
+        contacts: Impact contact points, shape (c, 3).
+        normals: Unit normals at the contact points, shape (c, 3).
         feet: Contact points of the supports, shape (f, 3).
         rotors: Circles of the propellers, shape (r, 3, points).
         hulls: Hulls of the collision shapes; empty for a robot without shapes.
@@ -57,7 +57,7 @@ class Skeleton:
 
     @property
     def normal(self) -> Array:
-        """Normal of the first contact, shape (3,)."""
+        """Unit normal at the first contact point, shape (3,)."""
         return np.asarray(self.normals[0])
 
     @property
@@ -68,7 +68,7 @@ class Skeleton:
 
     @property
     def points(self) -> Array:
-        """All points that the figure has to show, shape (m, 3)."""
+        """All points that must be inside the figure, shape (m, 3)."""
         circles = self.rotors.transpose(0, 2, 1).reshape(-1, 3)
         origin = np.asarray(self.base.translation)[None]
         shapes = [hull.vertices for hull in self.hulls] or [self.body]
@@ -82,11 +82,11 @@ def build_skeleton(
     supports: Sequence[Support] = (),
     collisions: Iterable[tuple[str, str]] = (),
 ) -> Skeleton:
-    """Place the sticks at ``q``, shape (nq,).
+    """Return the sticks at ``q``, shape (nq,).
 
-    A bone joins the origins of a joint and its parent.  A base with four joints or more is a box instead.  Further
-    bones lead to contacts and feet, and from other last links of chains to :func:`link_tip`.  Shapes in
-    ``collisions``, pairs of names, are marked.
+    A stick joins the origins of a joint and its parent.  A base with at least four joints is a box.  Further sticks
+    lead to contact points and feet.  In other chains, the last stick leads to :func:`link_tip`.  ``collisions`` are
+    pairs of names of colliding shapes.
     """
     model = robot.model
     data = model.createData()
@@ -114,7 +114,7 @@ def build_skeleton(
         for point, end in zip(hanging, ends, strict=True)
         if point.joint >= first or not len(body)
     ]
-    # A link that already has a line to its foot or contact gets no line to its tip.
+    # A link that already has a stick to its foot or contact point gets no stick to its tip.
     done = {int(model.parents[i]) for i in range(1, model.njoints)}
     done |= {point.joint for point in hanging if np.linalg.norm(point.position) > 1e-3}
     for leaf in range(first, model.njoints):
@@ -135,8 +135,8 @@ def build_skeleton(
 
 
 def _across(model: pin.Model, q: Array) -> Array | None:
-    """Return the direction about which all joints turn and along which none slides; ``None`` for other robots."""
-    # Pinocchio returns a vector for a single joint.
+    """Return the unit normal of the plane in which all joints move; ``None`` if the robot is not planar."""
+    # For a single joint, Pinocchio returns a vector instead of a matrix, hence reshape.
     linear, angular = np.split(pin.computeJointJacobians(model, model.createData(), q).reshape(6, -1), 2)
     _, sizes, directions = np.linalg.svd(angular.T)
     across = np.asarray(directions[0])
@@ -150,7 +150,7 @@ def _body(model: pin.Model, base: pin.SE3) -> Array:
     if len(hips) < 4:
         return np.zeros((0, 3))
     low, high = hips.min(axis=0), hips.max(axis=0)
-    # Hips at the same height span a flat box, and the model does not contain the height of the body.
+    # If all hips have the same height, the box would be flat.  The model does not contain the height of the body.
     lacking = max(_LEAST_HEIGHT * float((high - low)[:2].min()) - float((high - low)[2]), 0.0)
     low[2], high[2] = low[2] - lacking / 2, high[2] + lacking / 2
     corners = [(x, y, z) for z in (low[2], high[2]) for x, y in _AROUND * (high - low)[:2] + low[:2]]
@@ -158,14 +158,14 @@ def _body(model: pin.Model, base: pin.SE3) -> Array:
 
 
 def link_tip(model: pin.Model, joint: int) -> Array:
-    """Return the frame of a link farthest from its joint, or else the center of mass, in joint axes."""
+    """Return the frame origin of a link farthest from its joint, or else the center of mass, in joint axes."""
     places = [np.array(f.placement.translation) for f in model.frames if f.parentJoint == joint]
     tip = max(places, key=lambda place: float(np.linalg.norm(place)), default=np.zeros(3))
     return tip if np.linalg.norm(tip) > 1e-3 else np.array(model.inertias[joint].lever)
 
 
 def _rotors(robot: Robot, places: list[pin.SE3]) -> Array:
-    """Return circles perpendicular to the thrust, as large as the spacing of the rotors allows."""
+    """Return circles perpendicular to the thrust directions.  Their radius follows from the rotor distances."""
     propulsion = robot.spec.propulsion
     if propulsion is None:
         return np.zeros((0, 3, 24))
@@ -176,7 +176,7 @@ def _rotors(robot: Robot, places: list[pin.SE3]) -> Array:
     radius = 0.4 * min(gaps, default=0.5)
     circles = []
     for center, rotor in zip(centers, propulsion.rotors, strict=True):
-        # The last point repeats the first.
+        # Drop the last point, which is equal to the first.
         ring = cone_rim(np.array(rotor.direction) / np.linalg.norm(rotor.direction), 90.0, radius, 25)[:, :-1]
         circles.append(place.rotation @ (center[:, None] + ring) + np.asarray(place.translation)[:, None])
     return np.array(circles)

@@ -1,4 +1,4 @@
-"""Figure ``snapshots``: sticks and shapes of the robot at three instants of a run, a row for each controller."""
+"""Figure ``snapshots``: the robot at three times of a run, in a row for each controller."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ _NOW: dict[str, Any] = {"color": BLUE, "linestyle": "-", "linewidth": 1.5, "zord
 _START: dict[str, Any] = {"color": "#a9a9a9", "linestyle": "-", "linewidth": 1.0, "zorder": 2.0}
 # Line styles of the arrow before a push and during a push.
 _PUSH: dict[int, dict[str, Any]] = {1: {"linestyle": (0, (2, 1.5)), "linewidth": 1.2}, 2: {"linewidth": 1.8}}
-# Time before the impact, s, at which no tick contains the impact yet.
+# The snapshot before the impact is taken this long before it, s, so that its tick does not contain the impact.
 _BEFORE = 0.005
 
 
 def instants(view: RunView) -> list[tuple[str, float]]:
-    """Return name and time (s) of the start, of the moment before the first impact, and of the end of its window.
+    """Return name and time (s) of three snapshots: start, just before the first impact, and end of its window.
 
-    Without an impact, return the start, the half and the end of the run.
+    Without an impact, the snapshots are at the start, the middle and the end of the run.
     """
     start = ("start", float(view.t[0]))
     if not view.impacts:
@@ -52,9 +52,9 @@ def instants(view: RunView) -> list[tuple[str, float]]:
 
 
 def snapshots_figure(views: Sequence[RunView]) -> Figure:
-    """Draw the robot from the side that shows n and most of the motion, with the surface, or the push as an arrow.
+    """Draw a side view of the robot that shows n and most of the motion, with the surface or the push (arrow).
 
-    All panels share a scale, in meters.
+    All panels have the same scale.
     """
     views = check_same(views, "figure snapshots")
     rows = [
@@ -72,7 +72,7 @@ def snapshots_figure(views: Sequence[RunView]) -> Figure:
             ends = np.vstack([tips, tips - arrow])
             low, high = np.minimum(low, ends.min(axis=0)), np.maximum(high, ends.max(axis=0))
     low, high = _window(low, high, views[0], plane)
-    # The robot sets the height, within the limits of a page.
+    # The robot determines the height of the panels, within the limits of a page.
     highest = float(np.clip(8.5 / len(views), 1.2, 3.0))
     height = float(np.clip(2.1 * (high - low)[1] / (high - low)[0], 1.2, highest)) + 0.2
     notes = [*stick_notes(rows[0][0]), _START_NOTE]
@@ -93,18 +93,17 @@ def snapshots_figure(views: Sequence[RunView]) -> Figure:
             axes_row[0].set_ylabel(f"{plot_label(view.name)}\n{plane.up}  [m]")
         for axes in panels[-1]:
             axes.set_xlabel(f"{plane.right}  [m]")
-        # The lowest panels name the viewing direction.
         panels[-1][1].set_xlabel(f"{plane.right}  [m]\nseen along {depth_of(plane)}")
         shared_legend(body, _handles(rows[0][0], views[0]), "lower")
     return figure
 
 
 def _window(low: Array, high: Array, view: RunView, plane: Plane) -> tuple[Array, Array]:
-    """Return the corners of a panel that shows all sticks, and the surface if it is seen from its edge."""
+    """Return the corners of a panel that shows all sticks, and the surface unless it faces the reader."""
     if view.surface is not None:
         touched = plane.axes @ view.surface
         n = plane.axes @ np.array(view.contact.normal)
-        # Perpendicular to its normal, the surface is unlimited.
+        # The surface extends without limit, so the panel must be larger only along its normal.
         edge = touched - 0.05 * float((high - low).max()) * n
         for axis in range(2):
             if abs(n[axis]) > 0.5:
@@ -113,14 +112,14 @@ def _window(low: Array, high: Array, view: RunView, plane: Plane) -> tuple[Array
 
 
 def _surface(axes: Any, view: RunView, plane: Plane, low: Array, high: Array) -> None:
-    """Draw the edge of the surface, hatched behind it, unless the surface faces the reader."""
+    """Draw the surface as a line with a hatched strip behind it, unless the surface faces the reader."""
     n = plane.axes @ np.array(view.contact.normal)
     if view.surface is None or np.linalg.norm(n) < 1e-6:
         return
     n = n / np.linalg.norm(n)
     size = 2 * float((high - low).max())
     point, along = plane.axes @ view.surface, size * np.array([-n[1], n[0]])
-    # The strip begins next to the middle of the panel.
+    # Move the reference point along the surface to the middle of the panel.
     point = point + along * float(along @ ((low + high) / 2 - point)) / size**2
     corners = np.array([point + along, point - along, point - along - size * n, point + along - size * n])
     axes.fill(*corners.T, facecolor="white", edgecolor=GRAY, hatch=HATCH, linewidth=0, zorder=0.5)
@@ -128,7 +127,7 @@ def _surface(axes: Any, view: RunView, plane: Plane, low: Array, high: Array) ->
 
 
 def _arrow(view: RunView, plane: Plane, reach: float) -> Array | None:
-    """Return the push from tail to tip in the figure; ``None`` without a push."""
+    """Return the arrow of the push as a vector of length ``reach``, shape (2,); ``None`` without a push."""
     largest = view.force[int(np.argmax(np.linalg.norm(view.force, axis=1)))]
     size = float(np.linalg.norm(largest))
     if not view.pushed or size == 0:

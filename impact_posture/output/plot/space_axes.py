@@ -1,4 +1,4 @@
-"""3-D axes with equal scales, and with ticks and names that do not overlap."""
+"""3-D axes with equal scales.  Their tick numbers and axis names do not overlap."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from impact_posture.output.plot.style import text_width
 from impact_posture.system.arrays import Array
 
 _TICKS = 6.5
-# Share of an axis without ticks at each end, where two axes meet.
+# No ticks within this share of the axis length at both ends, where two axes meet.
 _CORNER = 0.07
 
 
 class Space(Axes3D):  # type: ignore[misc]
-    """3-D axes with room for their names in the layout."""
+    """3-D axes whose layout has space for the axis names."""
 
     def get_tightbbox(self, renderer: Any = None, **more: Any) -> Any:
-        """Return the box around everything drawn, with the names, which matplotlib leaves out for the layout."""
+        """Return the box around the axes with their names.  Matplotlib ignores the names in the layout."""
         return super().get_tightbbox(renderer, **(more | {"for_layout_only": False}))
 
 
 def frame_space(axes: Any, low: Array, high: Array, unit: str, bins: int, *, azimuth: float) -> None:
-    """Give 3-D axes the limits ``low`` to ``high``, the same scale, few ticks, and names with the unit."""
+    """Give 3-D axes the limits ``low`` to ``high``, shape (3,), equal scales, few ticks, and names with the unit."""
     size = high - low
     axes.set_box_aspect(tuple(size))
     axes.view_init(elev=21, azim=azimuth)
@@ -34,14 +34,15 @@ def frame_space(axes: Any, low: Array, high: Array, unit: str, bins: int, *, azi
         axis = getattr(axes, f"{name}axis")
         share = float(size[k] / size.max())
         longest = _set_ticks(axis, low[k], high[k], round(bins * share), room=np.inf if name == "z" else 95 * share)
-        # Matplotlib centers numbers 8 and names 21 points off their axis in a cube, and nearer in a flat box.
+        # In a cube, matplotlib centers numbers 8 points and names 21 points from their axis.  In a flat box, these
+        # distances are smaller.
         scale = max(float(np.delete(size, k).mean() / size.max()), 0.25)
         axes.tick_params(axis=name, pad=(8 if name == "z" else 6) / scale - 8, labelsize=_TICKS)
         getattr(axes, f"set_{name}label")(f"{name}  [{unit}]", labelpad=(longest / 2 + 4) / scale - 13, fontsize=7.0)
 
 
 def _set_ticks(axis: Any, low: float, high: float, bins: int, room: float) -> float:
-    """Set few ticks whose numbers fit into ``room`` (points); return the width of the longest number, points."""
+    """Set few ticks, so that their numbers fit into ``room`` (points); return the width of the longest number."""
     air = _CORNER * (high - low)
     for count in range(max(bins, 3), 0, -1):
         ticks = np.asarray(MaxNLocator(count, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high))

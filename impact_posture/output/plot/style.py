@@ -1,4 +1,4 @@
-"""Style of all figures: a color-blind-safe palette that works in gray, print sizes, header, legend, saving."""
+"""Style of all figures: colors, sizes, header and legend.  Lay out figures and save them."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from impact_posture.output.plot.result_view import SEPARATOR
 from impact_posture.system.output_folder import check_name
 from impact_posture.system.scratch_folder import scratch_folder
 
-# Okabe and Ito's palette, "Color Universal Design", 2008.
+# Color-blind-safe palette of Okabe and Ito, "Color Universal Design", 2008.
 VERMILLION, BLUE, GREEN, SKY, PURPLE, ORANGE = "#D55E00", "#0072B2", "#009E73", "#56B4E9", "#CC79A7", "#E69F00"
 INK, GRAY, PALE = "#000000", "#6b6b6b", "#d9d9d9"
 
-# Before and after differ by line and hatch as well, so that a gray print tells them apart.
-# The dashed line lies on top, so the solid line shows in its gaps if both coincide.
+# Before and after also differ in line style and hatch, so they are distinguishable in a gray print.  The dashed line
+# is on top.  If both lines coincide, the solid line is visible in the gaps.
 BEFORE: dict[str, Any] = {"color": VERMILLION, "linestyle": (0, (4, 2)), "linewidth": 1.4, "zorder": 3.5}
 AFTER: dict[str, Any] = {"color": BLUE, "linestyle": "-", "linewidth": 1.6, "zorder": 3.0}
-# Lines of the robot without supports are thinner and have other dashes.
+# Lines for the robot without supports are thinner and have other dashes.
 FREE_BEFORE: dict[str, Any] = {"color": VERMILLION, "linestyle": (0, (1, 1.6)), "linewidth": 1.0, "zorder": 2.8}
 FREE_AFTER: dict[str, Any] = {"color": BLUE, "linestyle": (0, (6, 1.6, 1, 1.6)), "linewidth": 0.9, "zorder": 2.6}
 # Arrows of the worst normals of a cone.
@@ -61,26 +61,27 @@ _RC: dict[str, Any] = {
     "axes.linewidth": 0.7,
     "axes.grid": False,
     "axes.axisbelow": True,
-    # No ticks are above a panel.  By default, matplotlib searches for them whenever it measures or draws a panel.
+    # A fixed position of the title saves time: by default, matplotlib searches for ticks above every panel.
     "axes.titley": 1.0,
     "grid.color": PALE,
     "grid.linewidth": 0.5,
     "hatch.linewidth": 0.5,
     "legend.frameon": False,
     "figure.dpi": 200,
-    # At this resolution letters need no hinting, which takes a third of the time to draw them.
+    # At this resolution, letters need no hinting.  Hinting takes a third of the time to draw letters.
     "text.hinting": "none",
-    # PDF files use TrueType fonts, because publishers reject Type 3. Equal figures give equal files.
+    # PDF files use TrueType fonts, because publishers reject Type 3 fonts.
     "pdf.fonttype": 42,
+    # With a fixed salt, equal figures have equal SVG files.
     "svg.hashsalt": "impact-posture",
 }
 
 
 @contextmanager
 def style() -> Iterator[None]:
-    """Draw and save with the settings of this package, and restore the settings of the user afterwards."""
+    """Use the matplotlib settings of this package within the block, and restore the previous settings afterwards."""
     with matplotlib.rc_context(), warnings.catch_warnings():
-        # Matplotlib draws a box for a letter that the font lacks.
+        # Ignore the warning about missing letters, because matplotlib draws a box instead of the letter.
         warnings.filterwarnings("ignore", "Glyph .* missing from font")
         matplotlib.rcdefaults()
         matplotlib.rcParams.update(_RC)
@@ -91,9 +92,10 @@ def style() -> Iterator[None]:
 def framed(
     title: str, lines: Sequence[str], height: float, notes: Sequence[str] = ()
 ) -> Iterator[tuple[Figure, Any]]:
-    """Yield a figure with a header and notes, and the part to draw in, ``height`` inches high; apply :func:`style`.
+    """Yield a figure with a header and notes, and the subfigure for the panels, ``height`` inches high.
 
-    Long ``lines`` of small print below the title break between facts.  ``notes`` are sentences below the figure.
+    ``lines`` are small print below the title.  ``notes`` are sentences below the panels.  Long lines are wrapped.
+    Within the block, :func:`style` applies.
     """
     title = printable(title, longest=_LONGEST_TITLE)
     small = [part for line in lines for part in wrap(printable(line), SEPARATOR)]
@@ -111,10 +113,10 @@ def framed(
 
 
 def wrap(line: str, separator: str) -> list[str]:
-    """Break a line of small print at separators so that it fits the page, by the widths of the font."""
+    """Split a line of small print at separators, so that every part fits the width of the page."""
     parts, room, used = [""], 72 * WIDTH * 0.975, 0.0
     for piece in line.split(separator):
-        # Widths of pieces of text are cached, because most pieces occur several times.
+        # Measure each piece with its separator, because the cache of ``text_width`` contains most of these texts.
         width = text_width(f"{separator}{piece}".replace("$", ""), _SMALL)
         if parts[-1] and used + width > room:
             parts.append("")
@@ -126,7 +128,7 @@ def wrap(line: str, separator: str) -> list[str]:
 
 @lru_cache(maxsize=4096)
 def text_width(text: str, size: float) -> float:
-    """Return the width of a text, points."""
+    """Return the width of a text at a font size, points."""
     font = FontProperties(family="DejaVu Sans", size=size)
     return float(text_to_path.get_text_width_height_descent(text, font, ismath=False)[0])
 
@@ -142,7 +144,7 @@ def shared_legend(body: Any, handles: Sequence[Any], place: str) -> None:
         return sum(max(widths[k : k + rows]) for k in range(0, len(widths), rows))
 
     columns = next((n for n in range(len(handles), 1, -1) if width(n) <= room), 1)
-    # Rows of equal length, as few as possible.
+    # Keep the number of rows, but distribute the entries evenly over the rows.
     columns = -(-len(handles) // -(-len(handles) // columns))
     look = {"ncols": columns, "handlelength": handle, "columnspacing": gap}
     body.legend(handles=list(handles), loc=f"outside {place} center", **look)
@@ -152,7 +154,7 @@ def lay_out(figure: Figure) -> FigureCanvasAgg:
     """Lay out a figure once, so that it looks the same in every format; return its image."""
     engine: Any = figure.get_layout_engine()
     if engine is not None:
-        # Panels with equal axes change their size in the first round and are placed in the others.
+        # Panels with equal scales change their size in the first round.  The other rounds adjust their positions.
         equal = [axes for axes in figure.axes if axes.name == "3d" or axes.get_aspect() != "auto"]
         for axes in equal:
             _measure_once(axes)
@@ -160,9 +162,9 @@ def lay_out(figure: Figure) -> FigureCanvasAgg:
             engine.execute(figure)
         for axes in equal:
             del axes.get_tightbbox
-        # With any layout engine set, even an empty one, `savefig` would draw the figure twice.
+        # With a layout engine, ``savefig`` would draw the figure twice.
         figure.set_layout_engine(None)
-        # Rounded, because the solver of the layout differs in the last digits from run to run.
+        # Round positions, because the last digits of the layout differ between runs.
         for part in figure.subfigs:
             box = part.bbox_relative
             box.p0, box.p1 = np.round(box.p0, 6), np.round(box.p1, 6)
@@ -172,9 +174,9 @@ def lay_out(figure: Figure) -> FigureCanvasAgg:
 
 
 def _measure_once(axes: Any) -> None:
-    """Let the layout measure the texts around a flat panel in its first round only, because measuring takes long.
+    """Measure the texts around a 2-D panel only twice, because measuring takes long.
 
-    The space around a flat panel depends on its ticks, which do not change after the first round.
+    The space around a 2-D panel depends on its ticks, which do not change after the first round of the layout.
     """
     measure = axes.get_tightbbox
     around: list[Any] = []
@@ -191,7 +193,7 @@ def _measure_once(axes: Any) -> None:
 
 
 def check_formats(formats: Iterable[str]) -> tuple[str, ...]:
-    """Return the formats in order, once each; raise ``InputError`` for an unknown format."""
+    """Return the formats in lower case and without duplicates; raise ``InputError`` for an unknown format."""
     wanted = tuple(dict.fromkeys(f.lower().lstrip(".") for f in formats))
     for extension in wanted:
         if extension not in FORMATS:
@@ -200,15 +202,15 @@ def check_formats(formats: Iterable[str]) -> tuple[str, ...]:
 
 
 def save_all(figures: Mapping[str, Figure], out_dir: Path, formats: Iterable[str] = DEFAULT_FORMATS) -> list[Path]:
-    """Write each figure under its name as :func:`save` does; return the paths."""
+    """Write ``figures``, name → figure, with :func:`save`; return the paths."""
     return [path for name, figure in figures.items() for path in save(figure, out_dir, name, formats)]
 
 
 def save(figure: Figure, out_dir: Path, name: str, formats: Iterable[str] = DEFAULT_FORMATS) -> list[Path]:
-    """Write ``out_dir/name.<format>`` for each format, each file completely or not at all; return the paths.
+    """Write ``out_dir/name.<format>`` for each format; return the paths.  An error leaves no incomplete file.
 
     Raises:
-        InputError: An unknown format.
+        InputError: A format is unknown.
         OutputError: The folder or a file cannot be written.
     """
     paths = [Path(out_dir) / f"{name}.{extension}" for extension in check_formats(formats)]
@@ -220,12 +222,13 @@ def save(figure: Figure, out_dir: Path, name: str, formats: Iterable[str] = DEFA
             path.parent.mkdir(parents=True, exist_ok=True)
             with scratch_folder(path.parent) as beside, style():
                 if path.suffix == ".png":
-                    # `savefig` would draw the figure again.  Three channels suffice and take a quarter less time.
-                    # A higher level of compression takes much longer and makes files only 3 % smaller.
+                    # Save the image directly, because ``savefig`` would draw the figure again.  Writing three
+                    # channels takes a quarter less time than four.  A higher level of compression takes much longer
+                    # and makes files only 3 % smaller.
                     picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
                     picture.save(beside / path.name, compress_level=3, dpi=(figure.dpi, figure.dpi))
                 else:
-                    # Without a date, the same result gives the same file.
+                    # Files contain no date, so equal figures have equal files.
                     metadata = {"Date" if path.suffix == ".svg" else "CreationDate": None}
                     figure.savefig(beside / path.name, metadata=metadata)
                 os.replace(beside / path.name, path)

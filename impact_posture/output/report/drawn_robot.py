@@ -1,4 +1,4 @@
-"""The shapes of a robot on the page: small meshes, each stored once, with their licenses."""
+"""Shapes of a robot for the 3-D view of a report: simplified meshes, and their licenses."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ from impact_posture.robot.urdf import example_robot_data
 from impact_posture.system.arrays import Array
 from impact_posture.system.libraries import source_key
 
-# Largest number of triangles of all meshes on a page. It limits the size of the page and the time to draw it in
-# software.
+# Maximum number of triangles of all meshes on a page.  It limits the size of the page, and the time to draw the robot
+# without a GPU.
 _MOST_TRIANGLES = 150_000
-# Corners of a mesh are integer multiples of its extent divided by this.
+# Number of steps into which the largest extent of a mesh is divided.  Corners are rounded to these steps.
 _LEVELS = 65535
 _GRAY = (0.72, 0.74, 0.77, 1.0)
-# Darker colors would hide the form.
+# Minimum of each color channel, because shading is not visible on darker colors.
 _DARKEST = 0.2
-# Triangles of a box.  Corner k is at the upper end of an axis if the bit of this axis is set in k.
+# Triangles of a box.  Bit i of the corner number is 1 if the corner is at the upper end of axis i.
 _BOX_FACES = np.array(
     [[0, 2, 1, 1, 2, 3, 4, 5, 6, 5, 7, 6, 0, 1, 4, 1, 5, 4], [2, 6, 3, 3, 6, 7, 0, 4, 2, 2, 4, 6, 1, 3, 5, 3, 7, 5]],
     dtype=np.uint32,
@@ -48,9 +48,13 @@ _Placement = Annotated[
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """A triangle mesh, whose corners are integer multiples of ``step`` (m) from ``low`` (m), shape (k, 3).
+    """Triangle mesh with rounded corners.
 
-    The faces are indices of corners, shape (n, 3).
+    Attributes:
+        corners: Corners as integer multiples of ``step`` from ``low``, shape (k, 3).
+        faces: Corner indices of each triangle, shape (n, 3).
+        low: Lower corner of the bounding box, m, shape (3,).
+        step: Step of the rounding, m.
     """
 
     corners: StoredArray
@@ -68,8 +72,10 @@ class Solid:
 class PlacedSolids:
     """Meshes and their placements.
 
-    ``places`` has for each shape its name, joint, index of its mesh, and placement in the axes of the joint.
-    ``warnings`` name shapes that are left out, one line each.
+    Attributes:
+        solids: Meshes; several shapes may share a mesh.
+        places: For each shape: its name, joint, index of its mesh, and placement relative to the joint.
+        warnings: A line for each shape that is left out.
     """
 
     solids: tuple[Solid, ...]
@@ -79,9 +85,13 @@ class PlacedSolids:
 
 @dataclass(frozen=True)
 class MeshLicense:
-    """The terms of the meshes of a package (a folder in example-robot-data), as the package states them.
+    """License of the meshes in a package, which is a folder in example-robot-data.
 
-    ``upstream`` is the address of the original.  ``license`` and ``text`` are empty if the package has none.
+    Attributes:
+        package: Name of the folder.
+        license: Name of the license; empty if the package states no license.
+        upstream: Address of the original meshes.
+        text: Text of the license; empty if the package contains no license text.
     """
 
     package: str
@@ -91,17 +101,19 @@ class MeshLicense:
 
     @property
     def allows(self) -> bool:
-        """Whether simplified meshes may be passed on: the package states a license that permits changed copies."""
+        """Whether the license permits copies of simplified meshes."""
         return bool(self.license) and "-ND" not in self.license.upper()
 
 
 @dataclass(frozen=True, eq=False)
 class DrawnRobot:
-    """The shapes of a robot.
+    """Shapes of a robot for the 3-D view.
 
     Attributes:
-        parts: For each shape: joint, index of its mesh, placement in the axes of the joint, and color (RGB, opacity).
-        notes: Notes on replaced or missing shapes, one line each.
+        solids: Meshes; several shapes may share a mesh.
+        parts: For each shape: joint, index of its mesh, placement relative to the joint, and color (RGB, opacity).
+        licenses: Licenses of the meshes on the page.
+        notes: A line for each replaced or missing shape.
     """
 
     solids: tuple[Solid, ...]
@@ -112,9 +124,9 @@ class DrawnRobot:
 
 @lru_cache(maxsize=4)
 def draw_robot(robot: Robot, meshes: bool = False) -> DrawnRobot:
-    """Return the visual shapes of a robot, with hulls for meshes that may not be passed on.
+    """Return the visual shapes of a robot.  Hulls replace meshes whose license does not permit copies.
 
-    A robot without shapes gets sticks.  ``meshes`` permits to pass on the meshes of the user's own URDF.
+    A robot without shapes gets sticks.  If ``meshes`` is true, the user permits copies of all meshes.
     """
     described, warnings = read_urdf_shapes(robot, "visual")
     by_name = {shape.name: shape for shape in described}
@@ -139,14 +151,14 @@ def draw_robot(robot: Robot, meshes: bool = False) -> DrawnRobot:
 
 
 def _placed_solids(robot: Robot, described: list[UrdfShape], hulls: set[str]) -> PlacedSolids:
-    """Return the meshes of shapes, or their hulls."""
+    """Return the meshes of the shapes; for names in ``hulls``, the convex hulls of the meshes."""
     loaded = load_geometry(robot, described)
     by_name = {shape.name: shape for shape in described}
     solids: dict[tuple[object, ...], Solid] = {}
     places = []
     for placed in loaded.model.geometryObjects:
         shape, hull = by_name[placed.name], placed.name in hulls
-        # The same file at the same scale is the same mesh.
+        # Shapes with the same file and scale share a mesh.
         key = (shape.kind, shape.sizes, shape.mesh, hull)
         if key not in solids:
             solids[key] = hull_of(shape_points(placed.geometry)) if hull else _quantized(*surface_of(placed.geometry))
@@ -166,12 +178,12 @@ def _quantized(points: Array, faces: Triangles) -> Solid:
 
 
 def _welded(solid: Solid, bits: int) -> Solid:
-    """Join corners that agree except for their last ``bits``, and drop triangles that vanish."""
+    """Merge corners that differ only in their last ``bits``, and remove triangles that become degenerate."""
     keys = (solid.corners >> bits).astype(np.int64) @ (1 << np.array([32, 16, 0]))
     _, first, merged = np.unique(keys, return_index=True, return_inverse=True)
     faces = merged[solid.faces]
     faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
-    # In the order of first use, neighboring corners are close, which compresses well.
+    # Sort corners by their first use.  Then successive corners are close to each other and compress well.
     used, at = np.unique(faces, return_index=True)
     order = used[np.argsort(at)]
     renamed = np.empty(len(first), dtype=np.uint32)
@@ -180,7 +192,7 @@ def _welded(solid: Solid, bits: int) -> Solid:
 
 
 def _reduced(solids: list[Solid]) -> list[Solid]:
-    """Weld corners within a growing length until all meshes together have few enough triangles."""
+    """Merge corners within an increasing distance, until the meshes have at most ``_MOST_TRIANGLES`` triangles."""
     length = max((solid.step for solid in solids), default=0.0)
     while sum(len(solid.faces) for solid in solids) > _MOST_TRIANGLES:
         length *= 2
@@ -190,7 +202,7 @@ def _reduced(solids: list[Solid]) -> list[Solid]:
 
 
 def _coarser(solid: Solid, bits: int) -> Solid:
-    """Return a mesh without the last ``bits`` of its corners, or the bounding box if all triangles vanish."""
+    """Merge corners that differ only in their last ``bits``; return the bounding box if no triangle remains."""
     welded = _welded(solid, bits)
     if len(welded.faces):
         return welded
@@ -200,7 +212,7 @@ def _coarser(solid: Solid, bits: int) -> Solid:
 
 
 def _sticks(robot: Robot) -> tuple[list[Solid], list[tuple[int, int, pin.SE3, Color]]]:
-    """Return rods from each joint to the next joints, and from the last joint of a chain to the tip of its link."""
+    """Return rods between successive joints, and a rod from the last joint of each chain to the tip of its link."""
     model = robot.model
     spans = [(int(model.parents[k]), np.array(model.jointPlacements[k].translation)) for k in range(1, model.njoints)]
     inner = {parent for parent, _ in spans}
@@ -212,7 +224,7 @@ def _sticks(robot: Robot) -> tuple[list[Solid], list[tuple[int, int, pin.SE3, Co
 
 
 def _color(shape: UrdfShape) -> Color:
-    """Return the color in the URDF, or the mean color of a COLLADA file (which coal drops), or gray."""
+    """Return the color in the URDF, or the mean color in a COLLADA file (coal does not read colors), or gray."""
     *color, opacity = shape.color or _GRAY
     if shape.color is None and shape.mesh is not None and shape.mesh.suffix.lower() == ".dae":
         with shape.mesh.open("rb") as file:
@@ -223,7 +235,7 @@ def _color(shape: UrdfShape) -> Color:
 
 
 def license_of(mesh: Path) -> MeshLicense | None:
-    """Return the license of a mesh of example-robot-data; ``None`` for other meshes."""
+    """Return the license of a mesh in example-robot-data; ``None`` for other meshes."""
     try:
         root = example_robot_data().resolve()
     except PackageNotFound:
@@ -234,7 +246,7 @@ def license_of(mesh: Path) -> MeshLicense | None:
 
 @cache
 def _read_license(folder: Path) -> MeshLicense:
-    """Read the README of a package, which states ``license:`` and ``upstream:``, and its LICENSE."""
+    """Read README.md (lines ``license:`` and ``upstream:``) and LICENSE of a package."""
     readme, text = (
         path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
         for path in (folder / "README.md", folder / "LICENSE")

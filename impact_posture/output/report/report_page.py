@@ -1,4 +1,4 @@
-"""The page of a report: text, tables, curves and figures without scripts, and a viewer with a script."""
+"""Write the HTML page of a report.  Only its 3-D viewer needs a script."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from impact_posture.system.output_folder import write_whole
 from impact_posture.version import __version__
 
 _VIEWER = Path(__file__).parent / "viewer"
-# Colors of a figure.  Lines and letters need few colors, and 64 colors make a figure four times smaller.
+# Number of colors in a PNG figure.  Figures need few colors, and 64 colors make a file four times smaller.
 _COLORS = 64
 _TYPES = {".png": "image/png", ".svg": "image/svg+xml"}
-# Area of a curve in its chart, in the units of the view box.
+# Area of the curve in a chart, in units of the SVG view box.
 _LEFT, _RIGHT, _TOP, _BOTTOM = 60.0, 390.0, 8.0, 92.0
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table of text, whose cells are a name, then numbers or short words."""
+    """Table of a report.  The first cell of a row is a name; other cells are numbers or short texts."""
 
     title: str
     head: tuple[str, ...]
@@ -40,13 +40,16 @@ class Table:
 
 @dataclass(frozen=True)
 class Content:
-    """The text and tables of a page.
+    """Texts and tables of a report.
 
     Attributes:
-        command: Command that makes the same result again.
-        facts: Small print below the title.
-        verdict: Lines, the most important first.
-        moves: Sentences on the motion of the slider.
+        title: Title of the page.
+        command: Command that reproduces the result.
+        facts: Notes on robot, contact and settings.
+        verdict: Lines at the top, the most important line first.
+        tables: Tables of numbers.
+        moves: Sentences that explain what the slider moves.
+        notes: Further notes, such as warnings.
         sources: Name and content of the files that the command reads.
     """
 
@@ -61,7 +64,7 @@ class Content:
 
 
 def write_page(folder: Path, content: Content, scene: ReportScene) -> Path:
-    """Write ``report.html`` with the figures of a folder into this folder; return its path.
+    """Write ``report.html`` into a folder; return its path.  The page contains the figures in the folder.
 
     Raises:
         OutputError: The page cannot be written.
@@ -71,11 +74,11 @@ def write_page(folder: Path, content: Content, scene: ReportScene) -> Path:
 
 
 def render(content: Content, scene: ReportScene, pictures: Sequence[tuple[str, str]]) -> str:
-    """Return the page.  All texts are escaped; the page loads nothing and runs nothing but its own viewer."""
+    """Return the page.  All texts are escaped.  The page loads no other files and runs only its own viewer."""
     packed, arrays = scene.packed
     files = ("viewer.min.js", "loader.js", "page.css")
     viewer, loader, style = ((_VIEWER / name).read_text(encoding="utf-8") for name in files)
-    # A script ends at the first "</", even inside text.
+    # In HTML, a script element ends at the first "</script", even within JSON text.
     data = packed.replace("<", "\\u003c")
     text: str = _template().render(
         content=content, scene=scene, pictures=pictures, data=data, arrays=arrays, style=style, loader=loader,
@@ -87,10 +90,10 @@ def render(content: Content, scene: ReportScene, pictures: Sequence[tuple[str, s
 
 
 def figures(folder: Path) -> list[tuple[str, str]]:
-    """Return name and address of each figure in a folder and below: SVG, or else PNG in fewer colors."""
-    # Links are skipped, because the page would contain their target, which may not belong to the result.
+    """Return name and data URL of each figure in a folder and its subfolders.  SVG files are preferred to PNG."""
+    # Skip symbolic links, because the page would contain their targets, which may not belong to the result.
     paths = (p for p in sorted(folder.rglob("*")) if p.suffix in _TYPES and p.is_file() and not p.is_symlink())
-    # An SVG follows the PNG of the same name and replaces it.
+    # In the sorted list, an SVG file follows the PNG file with the same name and replaces it.
     by_name = {str(path.relative_to(folder).with_suffix("")): path for path in paths}
     return [(name, _address(path)) for name, path in by_name.items()]
 
@@ -101,7 +104,7 @@ def _address(path: Path) -> str:
         from PIL import Image
 
         try:
-            # For another format, Pillow may start a program such as Ghostscript.
+            # Allow only PNG, because Pillow may start a program such as Ghostscript for other formats.
             with Image.open(path, formats=("PNG",)) as picture, io.BytesIO() as file:
                 picture.convert("RGB").quantize(_COLORS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(
                     file, "PNG", compress_level=6
@@ -125,7 +128,7 @@ def _template() -> Any:
     def shown(value: object) -> object:
         return printable(value, keep="\n\t") if isinstance(value, str) and not isinstance(value, Markup) else value
 
-    # Every text is escaped, and characters that change the writing direction are removed.
+    # Jinja escapes every text, and ``shown`` replaces control characters.
     environment = Environment(
         loader=FileSystemLoader(_VIEWER), autoescape=True, undefined=StrictUndefined, finalize=shown,
         trim_blocks=True, lstrip_blocks=True,
@@ -134,7 +137,7 @@ def _template() -> Any:
 
 
 def _charts(track: Track) -> list[dict[str, Any]]:
-    """Return each curve of a track as lines in a chart, with the marks of the axes."""
+    """Return the polylines, axis numbers and texts of the chart of each curve."""
     charts = []
     x = _LEFT + (_RIGHT - _LEFT) * (track.times - track.times[0]) / ((track.times[-1] - track.times[0]) or 1.0)
     for name, unit, values in track.curves:
@@ -142,8 +145,7 @@ def _charts(track: Track) -> list[dict[str, Any]]:
         low, high = (float(values[known].min()), float(values[known].max())) if known.any() else (0.0, 0.0)
         low = min(low, 0.0) if low < 0.4 * high else low
         y = _BOTTOM - (_BOTTOM - _TOP) * (values - low) / ((high - low) or 1.0)
-        # The dictionary drops repeated points, because most frames that are 1 ms apart have the same rounded
-        # position.
+        # A dictionary removes repeated points, because frames 1 ms apart often have the same rounded position.
         points = [(f"{a:.1f},{b:.1f}", bool(good)) for a, b, good in zip(x, y, known, strict=True)]
         runs = [(good, dict(each)) for good, each in groupby(points, key=lambda point: point[1])]
         ends = [number(float(values[k])) for k in (0, -1)]

@@ -1,4 +1,4 @@
-"""The 3-D scene of a report: the robot, what stands around it, and what moves, packed for the viewer."""
+"""The 3-D scene of a report: robot, surfaces, obstacles and motions, encoded for the viewer."""
 
 from __future__ import annotations
 
@@ -26,27 +26,27 @@ from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 
 _TYPES = {"uint16": "u2", "uint32": "u4", "float32": "f4"}
-# Directions from which the camera may look first.
+# Candidates for the initial direction from the center to the camera.
 _EYES = np.array([[x, y, 0.55] for x in (1.1, -1.1) for y in (-1.25, 1.25)])
-# Best cosine between the viewing direction and the normal of the surface: neither edge-on nor from behind.
+# Preferred cosine of the angle between the direction to the camera and the surface normal: an oblique view.
 _SLANT = 0.35
-# A curve: name, unit, and values at the frames.
+# Name, unit, and value of a curve at each frame.
 Curve = tuple[str, str, Array]
 
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """A motion of the robot, frame by frame.
+    """Motion of the robot, given at frames.
 
     Attributes:
-        name: Name of the track beside others.
-        times: Times, s, or path lengths, rad mixed with m, increasing, shape (frames,).
+        name: Name of the motion in a report with several motions.
+        times: Time (s) or path length (rad mixed with m) of each frame, increasing, shape (frames,).
         unit: ``s`` for times; empty for path lengths.
         q: Configurations, shape (frames, nq).
-        impacts: Quantities of the impact of each contact, frame by frame.
-        jumps: Velocity jump ``Δν``, shape (frames, nv).
-        curves: Curves, NaN where undefined.
-        forces: Contact force on the robot, world, N, shape (frames, 3); ``None`` to show none.
+        impacts: For each contact, the impact quantities at each frame.
+        jumps: Velocity jumps ``Δν``, shape (frames, nv).
+        curves: Curves to draw.  Undefined values are NaN.
+        forces: Contact force on the robot, world, N, shape (frames, 3); ``None`` to draw no force.
     """
 
     name: str
@@ -64,9 +64,12 @@ class ReportScene:
     """Everything that the viewer draws.
 
     Attributes:
+        drawn: Shapes of the robot.
+        objective: Objective with robot, contacts and supports.
+        tracks: Motions of the robot.
         planes: Name (``surface`` or ``ground``), point (m) and unit normal of each plane, world.
-        bodies: Points of each convex body in the world, shape (k, 3), m.
-        ghost: Whether the first frame stays visible while the robot moves on.
+        bodies: Vertices of convex obstacles, world, m, shape (k, 3) each.
+        ghost: Whether the robot at the first frame stays visible while the robot moves.
     """
 
     drawn: DrawnRobot
@@ -78,7 +81,7 @@ class ReportScene:
 
     @cached_property
     def packed(self) -> tuple[str, str]:
-        """The scene as JSON, and its arrays as base64 of a gzipped buffer into which the JSON points."""
+        """The scene as JSON, and a gzipped buffer as base64.  The JSON refers to arrays in the buffer."""
         model = self.objective.robot.model
         tracks, arrows_of = zip(*map(self._track, self.tracks), strict=True)
         low, high = self._box()
@@ -93,7 +96,7 @@ class ReportScene:
         feet = [point_on(self.objective.robot, foot.frame, foot.offset) for foot in self.objective.supports]
         joints = zip(model.parents, model.inertias, strict=True)
         jump = 0.3 * size / _largest(track["largest_jump"] for track in tracks)
-        # The camera sees the tips of the arrows as well.
+        # The initial view includes the tips of the arrows.
         radius = max(size / 2, *(_norm(centers + jump * arrows - center) for centers, arrows in arrows_of))
         content = {
             "joints": [{"parent": int(parent), "center": inertia.lever} for parent, inertia in joints],
@@ -120,7 +123,7 @@ class ReportScene:
         return _packed(content)
 
     def _track(self, track: Track) -> tuple[dict[str, Any], tuple[Array, Array]]:
-        """Return the content of a track, and where its arrows begin and where to, shape (frames, links, 3) each."""
+        """Return the JSON content of a motion, and tails and vectors of its arrows, shape (frames, links, 3) each."""
         robot, frames, data = self.objective.robot, len(track.q), self.objective.robot.model.createData()
         points = [point_on(robot, contact.frame, contact.offset) for contact in self.objective.contacts]
         poses, at = np.empty((frames, robot.model.njoints - 1, 7)), np.empty((frames, len(points), 3))
@@ -133,7 +136,7 @@ class ReportScene:
                 twist, lever = data.v[j], robot.model.inertias[j].lever
                 arrows[k, j] = data.oMi[j].rotation @ (twist.linear + np.cross(twist.angular, lever))
                 centers[k, j] = data.oMi[j].act(lever)
-        # The viewer interpolates linearly, so each quaternion takes the sign nearer to the quaternion before.
+        # The viewer interpolates linearly.  So choose the sign of each quaternion that is closer to its predecessor.
         for before, now in pairwise(poses[:, :, 3:]):
             now[(before * now).sum(axis=-1) < 0] *= -1
         frame_impacts, upper = list(zip(*track.impacts, strict=True)), np.triu_indices(3)
@@ -165,7 +168,7 @@ class ReportScene:
 
 
 def impact_curves(impacts: Sequence[ImpactQuantities], metric: Metric, where: str = "") -> list[Curve]:
-    """Return the curves of H, V and S of a contact; ``where`` follows their names."""
+    """Return the curves of H, V and S at one contact.  ``where`` is appended to their names."""
     units = {key: unit for key, unit, _ in quantities(metric)}
     return [
         (name + where, units[name], np.array([getattr(impact, name) for impact in impacts], dtype=float))
@@ -174,12 +177,12 @@ def impact_curves(impacts: Sequence[ImpactQuantities], metric: Metric, where: st
 
 
 def _norm(vectors: Array) -> float:
-    """Return the largest norm of vectors along the last axis."""
+    """Return the largest norm of the vectors along the last axis of an array."""
     return float(np.linalg.norm(vectors, axis=-1).max())
 
 
 def _largest(values: Iterable[float]) -> float:
-    """Return the largest value, or 1 if it is zero, so that a scale stays finite."""
+    """Return the largest value, or 1 if it is zero, because the caller divides by it."""
     return max(values, default=0.0) or 1.0
 
 
@@ -190,21 +193,21 @@ def _solid(solid: Solid) -> dict[str, Any]:
 
 
 def _rows(frames: Iterable[list[Array]]) -> dict[str, Any]:
-    """Return the arrays of all contacts, a row for each frame, as :func:`_levels` does."""
+    """Encode the arrays of all contacts with :func:`_levels`, one row for each frame."""
     return _levels(np.array([np.concatenate(each) for each in frames]))
 
 
 def _levels(columns: Array) -> dict[str, Any]:
-    """Return columns as integer levels between the least and the largest value of each column."""
+    """Encode each column as integers from 0 (smallest value) to 65535 (largest value)."""
     low, step = columns.min(axis=0), np.maximum(np.ptp(columns, axis=0), 1e-12) / 65535
     values = np.round((columns - low) / step).astype(np.uint16)
     return {"values": _differences(values), "low": low, "step": step}
 
 
 def _differences(rows: NDArray[Any]) -> NDArray[Any]:
-    """Return the differences between rows of integers, the first from zero, because they compress better.
+    """Return the differences of successive rows, because differences compress better than values.
 
-    They wrap around, and the sums in the viewer wrap back.
+    Differences of unsigned integers overflow.  The sums in the viewer overflow in the same way, so they are exact.
     """
     return np.diff(rows, axis=0, prepend=np.zeros_like(rows[:1]))
 
@@ -220,11 +223,11 @@ def _packed(content: dict[str, Any]) -> tuple[str, str]:
         buffer.extend(array.tobytes())
         return [_TYPES[array.dtype.name], at, array.size]
 
-    # JSON has no NaN.
+    # ``allow_nan=False`` raises an error for NaN, which JSON does not support.
     return json.dumps(content, default=place, allow_nan=False), zipped(bytes(buffer))
 
 
 def zipped(content: bytes) -> str:
-    """Return base64 of gzip without a time stamp, so that equal results have equal pages."""
-    # The highest level takes three times as long and saves half a percent.
+    """Compress with gzip and encode as base64, without a time stamp, so that equal results have equal pages."""
+    # The highest compression level takes three times as long and saves half a percent.
     return base64.b64encode(gzip.compress(content, 6, mtime=0)).decode("ascii")

@@ -1,4 +1,4 @@
-"""The report of a posture optimization: the robot from the initial posture to the optimum."""
+"""Report of a posture optimization: content of the page, and the motion from the initial posture to the optimum."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from impact_posture.posture.formulation.problem_file import Prepared
 from impact_posture.system.arrays import Array
 from impact_posture.system.output_folder import typed_command
 
-# Largest number of frames of a motion.
+# Maximum number of frames of a motion over time.
 _MOST = 121
 
 
@@ -33,20 +33,20 @@ def write_result_report(
     meshes: bool = False,
     scene: ReportScene | None = None,
 ) -> Path:
-    """Write ``report.html`` of a result into its folder with ``problem.toml`` and the figures; return its path.
+    """Write ``report.html`` of a result, which contains ``problem.toml`` and the figures; return its path.
 
-    ``document`` is the content of ``result.json``, and ``scene`` is from :func:`result_scene`, if the caller has it.
-    ``meshes`` permits the report to hold the meshes of the user's own URDF.
+    ``document`` is the content of ``result.json``.  ``scene`` is an earlier return value of :func:`result_scene`.  If
+    ``meshes`` is true, the report may contain the meshes of the user's URDF.
 
     Raises:
-        OutputError: It cannot be written.
+        OutputError: The report cannot be written.
     """
     scene = scene or result_scene(prepared, view, meshes)
     return write_page(folder, _content(folder, prepared, view, document), scene)
 
 
 def result_scene(prepared: Prepared, view: ResultView, meshes: bool = False) -> ReportScene:
-    """Return the scene of a result, with the surface at its depth behind the contact point."""
+    """Return the 3-D scene of a result.  With surroundings, the surface may be behind the contact point."""
     around, q = prepared.problem.surroundings, view.q_initial
     if around is not None:
         walls, solids = around.walls_at(q)
@@ -79,10 +79,10 @@ def _track(prepared: Prepared, view: ResultView) -> Track:
 
 
 def _jumps(view: ResultView, postures: Array) -> tuple[Array, Array]:
-    """Return the jumps at postures, shape (n, nv), and the impulse of each contact, N·s, shape (n, contacts).
+    """Return the jump at each posture, shape (n, nv), and the impulse of each contact, N·s, shape (n, contacts).
 
-    All contacts act at once, or else the leading contact alone.  Where the impact is undefined, the jump is zero and
-    the impulse NaN.
+    All contacts act at once if their common jump is defined, otherwise only the first contact.  If the impact is
+    undefined, the jump is zero and the impulse is NaN.
     """
     objective, rebound, together = view.objective, (1 + view.restitution) * view.speed, _together(view)
     jumps = np.zeros((len(postures), objective.robot.nv))
@@ -100,18 +100,18 @@ def _jumps(view: ResultView, postures: Array) -> tuple[Array, Array]:
 
 
 def _together(view: ResultView) -> bool:
-    """Return whether several contacts have a common jump at the first and the last posture."""
+    """Return whether the common jump of several contacts is defined at the initial and the optimal posture."""
     ends = (view.q_initial, view.q_optimal)
     return bool(view.objective.others) and all(coulomb_jumps(view.objective, q, view.speed) for q in ends)
 
 
 def _frames(view: ResultView) -> tuple[Array, str, Array]:
-    """Return the times or path lengths of the slider, their unit, and the postures there."""
+    """Return the times (or path lengths) of all frames, their unit, and the postures at the frames."""
     if view.motion is not None and len(view.motion.t) > 1:
         kept = np.unique(np.linspace(0, len(view.motion.t) - 1, _MOST).astype(int))
         return view.motion.t[kept], "s", view.motion.q[kept]
     if view.path is not None and view.path.s[-1] > 0:
-        # Repeated points would have no order.
+        # Remove repeated points, because the path lengths of frames must increase.
         kept = np.flatnonzero(np.diff(view.path.s, prepend=-1.0) > 0)
         return view.path.s[kept], "", view.path.q[kept]
     return np.array([0.0, 1.0]), "", np.array([view.q_initial, view.q_optimal])
@@ -121,7 +121,7 @@ def _content(folder: Path, prepared: Prepared, view: ResultView, document: dict[
     title, small = header_lines(view)
     facts = [fact for fact in small[0].split(SEPARATOR) if not fact.startswith(ALONE)]
     certificate, solver = document["certificate"], document["solver"]
-    # Results of earlier versions do not have this number.
+    # Results of earlier versions do not contain this number.
     dominated = solver.get("dominated_starts", 0)
     checks = [
         ("stationarity", certificate["stationarity"], ""),
@@ -156,7 +156,7 @@ def _content(folder: Path, prepared: Prepared, view: ResultView, document: dict[
 
 
 def _before_and_after(prepared: Prepared, document: dict[str, Any]) -> Iterator[Table]:
-    """Yield the table of the impact, and a table of each further contact."""
+    """Yield a table for the first contact with the objective, and a table for each other contact."""
     blocks, contacts = [document[key] for key in ("initial", "optimal")], prepared.impact.objective.contacts
     for k, contact in enumerate(contacts):
         if k == 0:

@@ -1,4 +1,4 @@
-// Unpacks what report.html holds: its arrays, and the script of the viewer, whose hash the page allows.
+// Unpacks the arrays and the viewer script in report.html.
 const unpacked = (id) => {
   const bytes = Uint8Array.from(atob(document.getElementById(id).textContent), (c) => c.charCodeAt(0));
   return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream('gzip')));

@@ -1,4 +1,4 @@
-// The viewer of report.html: draws the scene that scene.py packed, at the frame that the slider names.
+// The viewer of report.html: draws the scene from report_scene.py at the frame that the slider selects.
 import {
   AmbientLight, BufferAttribute, BufferGeometry, Color, ConeGeometry, CylinderGeometry, DirectionalLight, DoubleSide, GridHelper, Group,
   Mesh, MeshBasicMaterial, MeshStandardMaterial, PerspectiveCamera, PlaneGeometry, Quaternion, Scene, SphereGeometry, Vector3, WebGLRenderer,
@@ -11,7 +11,7 @@ const TYPES = { u2: Uint16Array, u4: Uint32Array, f4: Float32Array };
 let data, buffer, track, draw = () => {}, at = 0, playing = false, waiting = false;
 
 const plain = ([type, offset, count]) => new TYPES[type](buffer, offset, count);
-// The arrays hold the differences between rows; sums wrap around in the type of the array, as the differences did.
+// The arrays contain differences of successive rows.  Sums overflow in the same way as the differences, so they are exact.
 const summed = (array, width) => { for (let i = width; i < array.length; i++) array[i] += array[i - width]; return array; };
 const levels = ({ values, low, step }) => Float32Array.from(summed(plain(values), low.length), (v, i) => low[i % low.length] + step[i % low.length] * v);
 
@@ -26,14 +26,12 @@ async function load() {
   }
 }
 
-// `width` numbers from column k on of an array with a row for each frame, between the two frames around `x`.
+// Returns `width` numbers, beginning at column k, of an array with a row for each frame, interpolated at frame `x`.
 function row(array, width, k = 0, x = at) {
   const columns = array.length / (track.last + 1), i = Math.floor(x), j = Math.min(i + 1, track.last);
   return Array.from({ length: width }, (_, c) => array[i * columns + k + c] * (1 - x + i) + array[j * columns + k + c] * (x - i));
 }
 const vector = (array, k = 0) => new Vector3(...row(array, 3, k));
-
-// ---- bodies ----------------------------------------------------------------------------------------------------------
 
 function geometry({ corners, faces }) {
   const found = new BufferGeometry();
@@ -80,7 +78,6 @@ function arrow(color, radius) {
   return group;
 }
 
-// The ellipsoid of contact i.
 function ellipsoid(i, color, opacity, wireframe) {
   const mesh = new Mesh(new SphereGeometry(1, ...(wireframe ? [14, 10] : [40, 24])), paint(color, opacity, { wireframe }));
   mesh.matrixAutoUpdate = false;
@@ -142,12 +139,12 @@ function stage(renderer) {
       one.span(body[k].localToWorld(new Vector3(...data.joints[k].center)), vector(track.jumps, 3 * k).multiplyScalar(data.scale.jump));
       one.visible &&= on('jumps');
     });
-    if (track.forces) { // The length grows with the root, so that a contact that is held is seen beside an impact.
+    if (track.forces) { // The length grows with the square root, so that small forces are visible beside impacts.
       const f = vector(track.forces), along = f.clone().multiplyScalar(data.scale.force / Math.sqrt(f.length() || 1));
       force.span(vector(track.points).sub(along), along);
     }
     force.visible &&= !!track.forces && on('force'); body[0].visible = on('robot');
-    // At the first frame the robot before and the robot now are the same, and would flicker.
+    // At the first frame, the robot and its ghost coincide and would flicker.
     ghost[0].visible = data.ghost && moved && on('ghost');
     for (const one of first) one.visible = data.ghost && moved && on('ellipsoids');
     for (const one of now) one.visible = on('ellipsoids');
@@ -156,8 +153,6 @@ function stage(renderer) {
     renderer.render(scene, camera); document.documentElement.dataset.ready = 'drawn';
   };
 }
-
-// ---- what the reader does ----------------------------------------------------------------------------------------------
 
 const format = (v) => (!Number.isFinite(v) ? 'undefined' : Math.abs(v) >= 1e5 ? v.toExponential(2) : String(+v.toPrecision(4)));
 const span = () => track.times[track.last] - track.times[0];
@@ -201,7 +196,7 @@ async function main() {
   if ($('track')) $('track').onchange = () => choose(+$('track').value);
   for (const svg of all('svg')) svg.onclick = (event) => seek(track.times[0] + (event.offsetX / svg.clientWidth * 400 - 60) / 330 * span());
   choose(0);
-  // A link may end in #0.5: the share of the frames at which the page opens.
+  // A link that ends in #0.5 opens the page at half of the frames.
   go(Number(location.hash.slice(1)) * track.last || 0);
   try {
     draw = stage(new WebGLRenderer({ canvas: $('view'), antialias: true }));
