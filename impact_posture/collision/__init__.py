@@ -1,1 +1,1 @@
-"""Collision shapes: sphere-swept convex hulls around the shapes of a URDF, and collision checks of the shapes."""
+"""Sphere-swept convex hulls around the shapes of a URDF, and collision checks of the shapes themselves."""

@@ -25,8 +25,8 @@ _UPRIGHT = pin.SE3(pin.rpy.rpyToMatrix(np.pi / 2, 0.0, 0.0), np.zeros(3))
 class Geometry(NamedTuple):
     """The shapes of a robot at their joints, without pairs, and the link of each shape.
 
-    ``apart``, shape (n, n), is true for two shapes that must not touch, according to the joints and the SRDF.
-    ``warnings`` are about shapes that are left out, one line each.
+    ``apart``, shape (n, n), tells whether two shapes must not touch.  ``warnings`` has a line for each shape that is
+    left out or changed.
     """
 
     model: pin.GeometryModel
@@ -36,10 +36,10 @@ class Geometry(NamedTuple):
 
 
 def load_geometry(robot: Robot, described: list[UrdfShape]) -> Geometry:
-    """Load the shapes that a URDF describes; a mesh that cannot be used is left out with a warning."""
+    """Load the shapes in a URDF; leave out unusable shapes with a warning."""
     model, largest = robot.model, largest_extent(robot)
     kept, solids, warnings = [], [], []
-    # Limbs share meshes, and loading a mesh may take a tenth of a second.
+    # Load a mesh that several limbs share only once, because loading may take a tenth of a second.
     loaded: dict[object, Corrected] = {}
     for shape in described:
         try:
@@ -70,9 +70,9 @@ def load_geometry(robot: Robot, described: list[UrdfShape]) -> Geometry:
 def _placed(
     model: pin.Model, shapes: list[UrdfShape], solids: list[Any], *, turned: bool
 ) -> list[pin.GeometryObject]:
-    """Return the shapes at their joints; ``turned`` turns meshes whose files say that y is up.
+    """Return the shapes at their joints; ``turned`` rotates meshes whose files state that the y axis is up.
 
-    ROS ignores the up axis of COLLADA files, so most URDFs need meshes that are not turned.
+    Most URDFs need meshes that are not rotated, because ROS ignores the up axis in COLLADA files.
     """
     objects = []
     for shape, solid in zip(shapes, solids, strict=True):
@@ -84,7 +84,7 @@ def _placed(
 
 
 def _gaps(model: pin.Model, objects: list[pin.GeometryObject]) -> float:
-    """Return a sum over all joints, m: each joint's distance to the boxes around the shapes of its parent link."""
+    """Return the sum of distances (m) from the joints to the boxes around the shapes of their parent links."""
     boxes: dict[int, list[Array]] = {}
     for solid in objects:
         points = shape_points(solid.geometry) @ solid.placement.rotation.T + solid.placement.translation
@@ -99,7 +99,7 @@ def _gaps(model: pin.Model, objects: list[pin.GeometryObject]) -> float:
 
 
 def geometry_key(robot: Robot, described: list[UrdfShape]) -> str:
-    """Return a hash of all data on which the swept hulls of a robot and their pairs depend."""
+    """Return a hash of all data that determine the swept hulls of a robot and the pairs that must not touch."""
     content = [coal.__version__, robot.kinematics_sha256]
     for shape in described:
         content.append(repr((shape.name, shape.link, shape.kind, shape.sizes, shape.placement.homogeneous.tolist())))

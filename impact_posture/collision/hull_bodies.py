@@ -1,4 +1,4 @@
-"""Merge shapes of a robot that fill a common convex hull."""
+"""Merge shapes of a robot that fill most of a common convex hull."""
 
 from __future__ import annotations
 
@@ -14,16 +14,17 @@ from impact_posture.collision.shape_corners import shape_points
 from impact_posture.collision.swept_hull import SweptHull, distance_from_hull, hull_corners
 from impact_posture.system.arrays import Array
 
-# Largest distance (m) of a point of a common hull from the shapes in it.
+# Largest distance (m) from a point of a common hull to the nearest shape inside.
 _FILL = 0.01
-# Points of a triangle, as weights of its corners.
+# Test points on a triangle, as weights of its corners.
 _PLACES = np.array([(i, j, 4 - i - j) for i in range(5) for j in range(5 - i)]) / 4
 
 
 class Body(NamedTuple):
-    """Shapes with a common hull: ascending indices in the geometry, and the corners of the hull of each shape.
+    """Shapes with a common hull.
 
-    The corners are in the axes of the joint, shape (k, 3) each, m.
+    ``shapes`` are ascending indices of shapes.  ``corners`` are the hull corners of each shape in the axes of the
+    joint, shape (k, 3), m.
     """
 
     shapes: tuple[int, ...]
@@ -31,17 +32,17 @@ class Body(NamedTuple):
 
 
 def merged_bodies(shapes: Sequence[pin.GeometryObject], apart: NDArray[np.bool_]) -> list[Body]:
-    """Merge shapes of a robot where this gives fewer pairs and hardly more volume.
+    """Merge shapes of a robot into bodies, so that fewer pairs of bodies must be checked for collisions.
 
-    Two bodies are merged if they have the same joint and must not touch the same shapes, and if no point of their
-    common hull is more than 1 cm from them.  ``apart`` tells whether two shapes must not touch, shape (n, n).
+    Two bodies are merged if they have the same joint, must stay apart from the same shapes, and no point of their
+    common hull is more than 1 cm from both.  ``apart``, shape (n, n), tells whether two shapes must not touch.
     """
     corners = [
         hull_corners(shape_points(shape.geometry) @ shape.placement.rotation.T + shape.placement.translation)
         for shape in shapes
     ]
     groups: dict[tuple[int, bytes], list[Body]] = {}
-    # Large hulls come first, because they absorb the small shapes inside them.
+    # Start with large hulls, because they absorb the small shapes inside them.
     for k in sorted(range(len(shapes)), key=lambda k: -float(np.prod(np.ptp(corners[k], axis=0)))):
         group = groups.setdefault((int(shapes[k].parentJoint), apart[k].tobytes()), [])
         body = Body((k,), (corners[k],))
@@ -54,12 +55,12 @@ def merged_bodies(shapes: Sequence[pin.GeometryObject], apart: NDArray[np.bool_]
 
 
 def _fill(a: Body, b: Body) -> bool:
-    """Tell whether two bodies fill their common hull up to the allowed distance."""
+    """Return whether no point of the common hull of two bodies is farther than ``_FILL`` from both."""
     parts = (*a.corners, *b.corners)
     points, part = np.vstack(parts), np.repeat(np.arange(len(parts)), [len(corners) for corners in parts])
     hull = SweptHull("", "", 0, points, 0.0)
     faces = hull.faces
-    # A face with all corners on the same part lies in that part, and points of a small face are near its corners.
+    # Check only large faces between different shapes.  Other faces lie in one shape, or near their corners.
     edges = np.linalg.norm(points[faces] - points[np.roll(faces, 1, axis=1)], axis=2).max(axis=1)
     open_faces = np.flatnonzero(np.any(part[faces] != part[faces[:, :1]], axis=1) & (edges > _FILL))
     solids = [SweptHull("", "", 0, _thinned(corners), 0.0) for corners in parts]

@@ -1,4 +1,4 @@
-"""Bounds on the joints between two bodies whose hulls overlap although their shapes do not."""
+"""Bounds on the joints between two bodies whose hulls overlap at postures where their shapes do not."""
 
 from __future__ import annotations
 
@@ -14,21 +14,22 @@ from impact_posture.config.cached_values import StoredArray
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 
-# Positions of each joint on the grid, and the largest number of joints between two bodies.
+# Number of grid positions per joint, and largest number of joints between two bodies.
 _TRIED, _MOST_JOINTS = 25, 3
 # Half of the largest range of a joint, rad (m), so that the step of the grid is at most half a radian.
 _MOST_HALF = 6.5
-# Largest number of planes of a pair, and the least share of the free positions that remains.
+# Largest number of planes of a pair of bodies, and smallest fraction of free positions that must remain.
 _MOST_PLANES, _LEFT = 12, 1 / 3
-# The cost of a plane is the number of free positions that it removes, plus this share of all free positions.
+# The cost of a plane is the number of removed free positions, plus this fraction of all free positions.
 _WORTH = 0.05
 
 
 @dataclass(frozen=True, eq=False)
 class JointPlanes:
-    """Planes ``normals θ ≤ bounds`` for one to three joints between two bodies.  Within them the shapes do not touch.
+    """Planes ``normals θ ≤ bounds`` for the one to three joints θ between two bodies.
 
-    ``normals`` are per rad (m), shape (k, m), without rows if the shapes touch nowhere.
+    The shapes of the bodies do not touch if θ satisfies all planes.  ``normals``, shape (k, m), are in 1/rad (1/m if
+    prismatic), and have no rows if the shapes never touch.
     """
 
     bodies: tuple[str, str]
@@ -40,15 +41,15 @@ class JointPlanes:
 def joint_planes(
     robot: Robot, names: tuple[str, str], joints: tuple[int, int], touch: Callable[[pin.Data], bool]
 ) -> JointPlanes | None:
-    """Return planes that separate the shapes of two bodies with these names and joints; ``None`` if none are found.
+    """Return planes that keep the shapes of two bodies apart, or ``None`` if the search fails.
 
-    The shapes are checked on a grid over the ranges of the joints.  Planes remove the positions where the shapes
-    touch, with the grid cells around them.  Each step adds the plane that removes the most of these positions per
-    lost free position.  ``touch`` tells whether the shapes touch at the placements in the data.
+    The shapes are checked on a grid over the ranges of the joints between the bodies.  Planes remove the positions
+    where the shapes touch, with their grid cells.  Each step adds the plane with the highest ratio of removed
+    touching positions to removed free positions.  ``touch`` tells whether the shapes touch at given placements.
     """
     model, start = robot.model, robot.posture()
     lowest, highest = model.lowerPositionLimit, model.upperPositionLimit
-    # The joints that move one body against the other, without joints of no range, which keep their position.
+    # The joints that move one body relative to the other, except joints with a range of zero.
     moving = sorted(set(model.supports[joints[0]]) ^ set(model.supports[joints[1]]))
     between = [k for k in moving if model.nqs[k] != 1 or lowest[model.idx_qs[k]] < highest[model.idx_qs[k]]]
     at = [model.idx_qs[k] for k in between]
@@ -73,13 +74,14 @@ def joint_planes(
 
 
 def _cut_off(hit: NDArray[np.bool_], positions: Array, step: float) -> tuple[Array, Array] | None:
-    """Return normals, shape (k, m), and bounds of planes that remove the positions hit, but not the origin.
+    """Return normals, shape (k, m), and bounds of planes that remove all positions ``hit``, but not the origin.
 
-    Positions are relative to the default posture, in units of half the ranges, shape (n, m), as is the grid step.
+    ``positions``, shape (n, m), are relative to the default posture.  ``positions`` and ``step`` are divided by half
+    the joint ranges.
     """
     free, left = positions[~hit], positions[hit]
     count = max(1, len(free))
-    # Along each axis, and between axes.
+    # Directions along each axis, and at equal angles to several axes.
     signs = np.array([signs for signs in product((-1, 0, 1), repeat=positions.shape[1]) if any(signs)], dtype=float)
     directions = signs / np.linalg.norm(signs, axis=1, keepdims=True)
     # Extent of the cells around a position along each direction.

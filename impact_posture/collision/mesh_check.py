@@ -1,4 +1,4 @@
-"""Check collisions of the shapes of the URDF with coal."""
+"""Check the shapes in the URDF for collisions with coal."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Standing = tuple[SweptHull, pin.SE3, Collection[int]]
 
 @dataclass(frozen=True, eq=False)
 class HalfSpace:
-    """The half-space behind a plane through ``point`` with the unit normal out of it, world, shape (3,), m.
+    """The half-space behind a plane, given by a point (m) and the unit normal out of the half-space, in world axes.
 
     Links of the joints ``exempt`` may be behind the plane.
     """
@@ -38,7 +38,7 @@ class HalfSpace:
 class MeshCheck:
     """Collision check of the shapes of a robot, prepared for many postures.
 
-    Overlaps of less than 1 µm are ignored.  Meshes are surfaces: a mesh wholly inside another does not collide.
+    Overlaps of less than 1 µm are ignored.  Meshes are surfaces, so a mesh entirely inside another does not collide.
     """
 
     def __init__(self, robot: Robot, shapes: RobotShapes) -> None:
@@ -90,7 +90,7 @@ class MeshCheck:
         return self._data.oMi[self._joints[index]] * self._shapes[index].placement
 
     def _within(self, away: Array, exempt: Collection[int]) -> Array:
-        """Return whether the ball around each shape reaches a body at this distance, as a column."""
+        """Return, as a column, whether the ball around each shape reaches a body at the distance ``away``."""
         allowed = np.array([joint not in exempt for joint in self._joints])
         return np.asarray((away <= self._reach) & allowed)[:, None]
 
@@ -103,7 +103,7 @@ def mesh_collisions(
 
 
 def _deep(a: Any, at_a: pin.SE3, b: Any, at_b: pin.SE3) -> bool:
-    """Tell whether two shapes still collide after they are moved apart by the tolerance."""
+    """Return whether two shapes still collide after a separation by the tolerance."""
     request, result = coal.CollisionRequest(), coal.CollisionResult()
     if not coal.collide(a, transform(at_a), b, transform(at_b), request, result):
         return False

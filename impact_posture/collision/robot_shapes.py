@@ -31,11 +31,9 @@ class FittedShapes:
         pairs: Pairs of bodies that must not touch, as indices into ``bodies``, shape (k, 2).
         always_touching: Names of shapes that touch at the default posture and at most other postures.  These shapes
             overlap by design, so their contact is allowed.
-        joint_planes: Bounds on joints for nested bodies, whose hulls touch at most postures at which their shapes do
-            not.  ``pairs`` leaves out nested bodies.
-        hulls_touching: Names of nested bodies for which no planes are found.  Only :class:`MeshCheck` finds their
-            collisions.
-        warnings: Shapes that are left out, one line each, or a line about a robot without shapes.
+        joint_planes: Bounds on joints for nested bodies (:func:`nested_pairs`), which ``pairs`` leaves out.
+        hulls_touching: Names of nested bodies without such bounds.  Only :class:`MeshCheck` detects their collisions.
+        warnings: Warnings about shapes, one line each.
     """
 
     bodies: tuple[SweptHull, ...]
@@ -66,7 +64,7 @@ class RobotShapes(FittedShapes):
 
 @dataclass(frozen=True)
 class _Source:
-    """Describe the shapes; equal keys and warnings give equal shapes."""
+    """Argument of :func:`_shapes`.  Sources with equal keys and warnings have equal shapes."""
 
     key: str
     robot: Robot = field(compare=False)
@@ -78,7 +76,7 @@ class _Source:
 def load_shapes(robot: Robot) -> RobotShapes:
     """Return the collision shapes of a robot from its URDF; links without collision shapes use their visual shapes.
 
-    The result is kept in memory, and in the user's cache by the content of the URDF and its meshes.
+    The result is cached in memory and on disk; the key is a hash of the URDF and its meshes.
     """
     described, warnings = read_urdf_shapes(robot)
     return _shapes(_Source(geometry_key(robot, described), robot, described, tuple(warnings)))
@@ -95,7 +93,7 @@ def _shapes(source: _Source) -> RobotShapes:
 
 
 def fit_shapes(robot: Robot, described: list[UrdfShape]) -> FittedShapes:
-    """Load the shapes, fit their hulls, and find the pairs; nested bodies get bounds on joints instead."""
+    """Load shapes, fit hulls, and determine the pairs that must not touch and the bounds for nested bodies."""
     tell("fitting collision shapes")
     loaded = load_geometry(robot, described)
     shapes, apart = loaded.model.geometryObjects, loaded.apart
@@ -130,7 +128,7 @@ def fit_shapes(robot: Robot, described: list[UrdfShape]) -> FittedShapes:
 
 
 def _fitted(body: Body, loaded: Geometry) -> SweptHull:
-    """Fit the hull of a body; a single ball or capsule is exact."""
+    """Fit the hull of a body; the hull of a single ball or capsule is exact."""
     shape = loaded.model.geometryObjects[body.shapes[0]]
     alone, solid, at = len(body.shapes) == 1, shape.geometry, shape.placement
     if alone and isinstance(solid, coal.Sphere):

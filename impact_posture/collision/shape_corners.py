@@ -1,9 +1,9 @@
 """Corners and triangles of coal shapes, with a correction of triangles that coal reads wrongly.
 
-A node of a file may have several parts, one for each material.  coal 3.0 appends the corners of all parts, but
-numbers the triangles of each part from the first corner of the node.  A part begins with its corners 0, 1 and 2 and
-uses all of its corners.  So the first corner of each part can be identified and checked.  If the check fails, the
-convex hull of the corners replaces the mesh, because it contains the mesh.
+A node of a mesh file may have several parts, one for each material.  coal 3.0 stacks the corners of all parts, but
+numbers the triangles of every part from the first corner of the node.  The triangles of a part begin with its corners
+0, 1 and 2 and use all its corners, so this module can detect the parts and check the result.  If the check fails, the
+convex hull of the corners, which contains the mesh, replaces the mesh.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from numpy.typing import NDArray
 from impact_posture.collision.swept_hull import SweptHull, hull_corners
 from impact_posture.system.arrays import Array
 
-# Corners of the polygon around a circle, which is 0.5 % larger.
+# Number of corners of the polygon around a circle.  The polygon is 0.5 % larger.
 _SIDES = 32
-# Points around a ball, whose hull is 2 % larger.
+# Number of points around a ball.  Their convex hull is 2 % larger.
 _BALL = 200
 
 Triangles = NDArray[np.int_]
 
 
 class Corrected(NamedTuple):
-    """A coal mesh, and whether it is the surface in the file (else its convex hull)."""
+    """A coal mesh, and whether it is exactly the mesh in the file, or else its convex hull."""
 
     mesh: Any
     exact: bool
@@ -80,9 +80,9 @@ def renumbered(count: int, faces: Triangles) -> Triangles | None:
 
 
 def _shifted(faces: Triangles, across: bool = False) -> Triangles:
-    """Return the triangles with the corners of each part numbered after the corners of the part before.
+    """Return the triangles with corner numbers that continue from part to part.
 
-    A part begins where the first corners of its node occur again, with ``across`` also at the corners of a new node.
+    A new part begins where the first corners of the node occur again; ``across`` also detects new nodes.
     """
     starts, shifts, begin = [0], [0], 0
     for k in np.flatnonzero((np.diff(faces, axis=1) == 1).all(axis=1))[1:]:
@@ -96,10 +96,7 @@ def _shifted(faces: Triangles, across: bool = False) -> Triangles:
 
 
 def shape_points(shape: Any) -> Array:
-    """Return points whose convex hull contains a shape, in the axes of the shape, shape (n, 3), m.
-
-    They are the corners of a box or mesh, or of a polyhedron around a round shape.
-    """
+    """Return points whose convex hull contains a shape, in the axes of the shape, shape (n, 3), m."""
     match shape:
         case coal.Box():
             return np.asarray(np.array(list(product((-1.0, 1.0), repeat=3))) * shape.halfSide)

@@ -1,4 +1,4 @@
-"""Pairs of shapes that must not touch, and pairs that touch at most of the sampled postures."""
+"""Pairs of shapes that must not touch, and pairs that touch at most postures."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import locate, srdf_path
 from impact_posture.system.arrays import Array
 
-# Numbers of random postures for shapes, and for hulls, of which far more pairs touch.
+# Numbers of random postures in mostly_touching and in nested_pairs.
 _POSTURES = 1000
 _COUNTED = 100
 _SEED = 0
@@ -29,7 +29,7 @@ def pairs_apart(
 ) -> NDArray[np.bool_]:
     """Return whether two shapes must not touch, shape (n, n), from the joint and the link of each shape.
 
-    Shapes of the same joint or of consecutive joints may touch, and so may the pairs of links that the SRDF disables.
+    Shapes of the same joint or of consecutive joints may touch.  Links of a pair in ``disabled`` may also touch.
     """
     joint = np.array(joints, dtype=int)
     parent = np.array(model.parents, dtype=int)[joint]
@@ -39,7 +39,7 @@ def pairs_apart(
 
 
 def pairs_of(apart: NDArray[np.bool_]) -> list[Pair]:
-    """Return the pairs that must not touch, the smaller index first."""
+    """Return the pairs that must not touch, with the smaller index first."""
     return [(int(i), int(j)) for i, j in np.argwhere(np.triu(apart))]
 
 
@@ -61,10 +61,10 @@ def mostly_touching(robot: Robot, shapes: Sequence[pin.GeometryObject], pairs: l
 def nested_pairs(
     robot: Robot, bodies: Sequence[SweptHull], pairs: list[Pair], touch: Callable[[Pair, pin.Data], bool]
 ) -> list[Pair]:
-    """Return the pairs of bodies whose hulls touch at most of the postures at which their shapes do not.
+    """Return the pairs of nested bodies, for example a shaft in a fork.
 
-    Such bodies are nested, such as a shaft in a fork.  Separate hulls would forbid most postures of the robot.
-    ``touch`` tells whether shapes of two bodies touch at the placements in the data.
+    At most of the postures where the shapes of nested bodies do not touch, their hulls overlap.  Keeping these hulls
+    apart would forbid most postures.  ``touch`` tells whether the shapes touch at the placements in the data.
     """
     data = robot.model.createData()
     apart, forbidden = np.zeros((2, len(pairs)), dtype=int)
@@ -96,7 +96,7 @@ def touch_of(shapes: Sequence[pin.GeometryObject]) -> Callable[[Pair, pin.Data],
 
 
 def random_postures(robot: Robot, count: int) -> Iterator[Array]:
-    """Yield random postures within the limits; a joint without limits turns by up to half a turn."""
+    """Yield random postures within the limits, and within half a turn of the default posture."""
     model, random, start = robot.model, np.random.default_rng(_SEED), robot.posture()
     low = np.maximum(model.lowerPositionLimit, start - np.pi)
     high = np.minimum(model.upperPositionLimit, start + np.pi)

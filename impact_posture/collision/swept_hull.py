@@ -17,9 +17,9 @@ from impact_posture.config.obstacle import Obstacle
 from impact_posture.system.arrays import Array
 
 MOST_VERTICES = 40
-"""Largest number of vertices of a hull, because each vertex is a row of a separating plane."""
+"""Largest number of vertices of a hull, because every vertex adds a constraint to the optimization."""
 
-# Half thickness (m) of the hull of a flat set of points, and largest thickness of a segment or point.
+# Points are flat if their extent (m) in a direction is smaller.  Half thickness of the hull of flat points.
 _THIN = 1e-4
 _REQUEST = coal.DistanceRequest(True)
 _REQUEST.gjk_tolerance = 1e-12
@@ -29,18 +29,18 @@ _TOLERANCE = 0.004
 # Largest number of candidates for corners; the sweep radius is computed from all points.
 _MOST_CANDIDATES = 4000
 _CHUNK = 20_000
-# For fewer points, computing a convex hull takes more time than it saves.
+# For fewer points, computing their convex hull takes more time than it saves.
 _FEW = 50
-# Error (m) of distances by coal.
+# Largest error (m) of distances that coal computes.
 _ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class SweptHull:
-    """The points within ``radius`` of a convex hull that moves with a joint.
+    """All points within ``radius`` of a convex hull that moves with a joint.
 
     Attributes:
-        name: Unique name in messages: the link, with ``[k]`` if the link has several shapes, and ``/k`` for a part.
+        name: Unique name for messages, made of the name of the link and the number of the shape.
         link: Name of the link.
         joint: Index of the joint in the model; 0 is the world.
         vertices: Corners of the hull in the axes of the joint, shape (k, 3) with k ≤ 40, m.
@@ -94,9 +94,9 @@ class SweptHull:
 
 
 class Separation(NamedTuple):
-    """Signed distance of two swept hulls with their radii, m; negative where the hulls penetrate each other.
+    """Signed distance of two swept hulls including their radii, m; negative if the hulls penetrate each other.
 
-    The unit normal points from ``b`` to ``a``.  It and the closest points are in world axes, shape (3,), m.
+    The unit normal points from ``b`` to ``a``.  Normal and closest points (m) are in world axes, shape (3,).
     """
 
     distance: float
@@ -106,7 +106,7 @@ class Separation(NamedTuple):
 
 
 def separation(a: SweptHull, placement_a: pin.SE3, b: SweptHull, placement_b: pin.SE3) -> Separation:
-    """Return the signed distance of two swept hulls with their joints at these placements in the world."""
+    """Return the signed distance of two swept hulls for world placements of their joints."""
     (shape_a, local_a), (shape_b, local_b) = a.solid, b.solid
     distance, result = _measure(shape_a, placement_a * local_a, shape_b, placement_b * local_b)
     points = np.array(result.getNearestPoint1()), np.array(result.getNearestPoint2())
@@ -123,7 +123,7 @@ def _measure(a: Any, at_a: pin.SE3, b: Any, at_b: pin.SE3) -> tuple[float, Any]:
     result = coal.DistanceResult()
     distance = coal.distance(a, transform(at_a), b, transform(at_b), _REQUEST, result)
     if not np.isfinite(result.normal).all():
-        # If two corners coincide, coal finds no direction until a corner moves by a nanometer.
+        # If two corners coincide, coal computes no normal.  A shift by a nanometer avoids this.
         at_a.translation = at_a.translation + np.array([0.6, 0.64, 0.48]) * 1e-9
         result = coal.DistanceResult()
         distance = coal.distance(a, transform(at_a), b, transform(at_b), _REQUEST, result)
@@ -136,9 +136,9 @@ def transform(placement: pin.SE3) -> Any:
 
 
 def hull_corners(points: Array) -> Array:
-    """Return the corners of the convex hull of points, shape (k, 3); one or two points, or a slab, if it is flat.
+    """Return the corners of the convex hull of points, shape (k, 3).
 
-    The corners of a slab are up to 0.1 mm outside the flat points, so that the hull has a volume.
+    Flat points are replaced by a slab of 0.2 mm thickness, points on a line by its ends, and close points by one.
     """
     middle = points.mean(axis=0)
     axes = np.linalg.eigh((points - middle).T @ (points - middle))[1]
@@ -160,12 +160,12 @@ def _convex_hull(points: Array) -> Any:
     try:
         return ConvexHull(points)
     except QhullError:
-        # The points are flat up to a rounding error.  QJ joggles them.
+        # The points are flat up to rounding errors.  The option QJ of Qhull joggles the points.
         return ConvexHull(points, qhull_options="QJ")
 
 
 class Fit(NamedTuple):
-    """Corners of a hull, shape (k, 3), m, and the sweep radius (m) that contains the points."""
+    """Corners of a hull, shape (k, 3), m, and the sweep radius (m) with which the hull contains all points."""
 
     vertices: Array
     radius: float
@@ -174,15 +174,15 @@ class Fit(NamedTuple):
 def fit_hull(points: Array, tolerance: float = _TOLERANCE) -> Fit:
     """Fit a sphere-swept convex hull that contains points, shape (n, 3), m.
 
-    Each step adds the corner farthest from the hull, until all corners are within the tolerance (m) or 40 are chosen.
-    The sweep radius is the largest distance of a point from the hull, so the result contains every point.
+    Each step adds the corner farthest from the hull, until all corners are within ``tolerance`` (m) or the hull has
+    40 corners.  The sweep radius is the largest distance of a point from the hull.
     """
     corners = hull_corners(points)
     candidates = corners[:: -(-len(corners) // _MOST_CANDIDATES)]
     axes = np.linalg.eigh(np.cov(candidates.T))[1] if len(candidates) > 1 else np.eye(3)
     chosen = list(dict.fromkeys(int(np.argmax(candidates @ axis)) for axis in np.hstack([axes, -axes]).T))
-    # A growing hull only reduces the distances of the points. Old distances are therefore upper bounds, and only
-    # the largest are computed again.
+    # A growing hull only reduces the distances of the points.  Old distances are therefore upper bounds, and only the
+    # largest are computed again.
     bounds = np.linalg.norm(candidates[:, None] - candidates[chosen], axis=2).min(axis=1)
     queue = [(-bound, k) for k, bound in enumerate(bounds.tolist())]
     heapify(queue)
@@ -212,7 +212,7 @@ def _extreme(points: Array) -> Array:
 
 
 def _outside(points: Array, hull: SweptHull) -> Array:
-    """Return the points outside a hull, computed in parts, so that a million points need little memory."""
+    """Return the points outside a hull.  Chunks of points limit the memory for a million points."""
     if not len(hull.faces):
         return points
     corners = hull.vertices[hull.faces] - hull.center
@@ -224,7 +224,7 @@ def _outside(points: Array, hull: SweptHull) -> Array:
 
 
 def obstacle_hull(obstacle: Obstacle) -> SweptHull:
-    """Return a box or a ball as a swept hull in the world."""
+    """Return an obstacle as a swept hull in the world."""
     name, center = obstacle.name, np.array(obstacle.position)
     if obstacle.box is None:
         return SweptHull(name, name, 0, center[None], float(obstacle.sphere or 0.0))

@@ -1,4 +1,4 @@
-"""Read the shapes of the links of a URDF, and explain why a shape cannot be used."""
+"""Read the shapes of links from a URDF, and explain why a shape cannot be used."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import locate
 from impact_posture.robot.urdf import parse_urdf, quiet_stderr
 
-# A shape larger than this (m), and larger than so many times the robot, must be in millimeters.
+# A shape larger than 5 m and larger than ten times the robot must be in millimeters.
 _LARGEST = 5.0
 _LARGEST_SHARE = 10.0
-# Bytes of a COLLADA file that are searched for the up axis.
+# Number of bytes at the start of a COLLADA file in which the up axis is searched.
 _HEAD = 10_000
-# Loading takes about 20 times the size of a binary STL in memory.
+# Largest mesh file, bytes, because loading a binary STL takes about 20 times its size in memory.
 _LARGEST_FILE = 100_000_000
-# Attributes with the sizes of a shape, and how many numbers each has.
+# Attributes with the sizes of each shape type, and the number of values in each attribute.
 _SIZES = {
     "box": {"size": 3},
     "sphere": {"radius": 1},
@@ -39,7 +39,7 @@ _SIZES = {
 
 
 class UnusableShape(Exception):
-    """A shape is left out; the text says why and what to do."""
+    """A shape cannot be used; the text states the reason and what to do."""
 
 
 @dataclass(frozen=True)
@@ -64,14 +64,14 @@ class UrdfShape:
 
     @cached_property
     def y_up(self) -> bool:
-        """Whether the mesh is a COLLADA file that says that y is up."""
+        """Whether the mesh is a COLLADA file which states that the y axis is up."""
         if self.mesh is None or self.mesh.suffix.lower() != ".dae":
             return False
         with self.mesh.open("rb") as file:
             return b"<up_axis>Y_UP" in file.read(_HEAD)
 
     def load(self, largest: float) -> Corrected:
-        """Return the coal shape, and whether it is exact or a convex hull; a shape larger than ``largest`` (m) fails.
+        """Return the coal shape, and whether it is exact or a convex hull; reject shapes larger than ``largest`` (m).
 
         Raises:
             UnusableShape: The mesh cannot be read, is empty, has numbers that are not finite, or is in millimeters.
@@ -85,9 +85,9 @@ class UrdfShape:
     def _load_mesh(self, largest: float) -> Corrected:
         try:
             with quiet_stderr():
-                # A new loader each time, because loaders keep the meshes that they load.
+                # Use a new loader every time, because a loader keeps all meshes in memory.
                 shape = coal.MeshLoader().load(str(self.mesh), np.array(self.sizes))
-        except Exception:  # The loader passes on all exceptions of assimp.
+        except Exception:  # The mesh library assimp may raise any exception.
             raise UnusableShape(f"{self.mesh} cannot be read as a mesh, or is empty; export it again") from None
         points = mesh_points(shape)
         if not np.isfinite(points).all():
@@ -102,7 +102,7 @@ class UrdfShape:
 
 
 def largest_extent(robot: Robot) -> float:
-    """Return the extent (m) above which a shape must be in millimeters: 5 m and ten times the extent of the robot."""
+    """Return the extent (m) above which a shape must be in millimeters: 5 m, or ten times the robot if larger."""
     data = robot.model.createData()
     pin.forwardKinematics(robot.model, data, robot.posture())
     points = [data.oMi[i].act(np.array(robot.model.inertias[i].lever)) for i in range(1, robot.model.njoints)]
@@ -111,9 +111,9 @@ def largest_extent(robot: Robot) -> float:
 
 
 def read_urdf_shapes(robot: Robot, first: str = "collision") -> tuple[list[UrdfShape], list[str]]:
-    """Return the shapes of a URDF, with paths of meshes, and a line for each shape that is left out.
+    """Return the shapes in the URDF of a robot, and a warning for each shape that is left out.
 
-    Where a link has both ``collision`` and ``visual`` shapes, ``first`` is the kind to use.
+    If a link has both ``collision`` and ``visual`` shapes, the shapes ``first`` are used.
 
     Raises:
         UrdfError: The URDF has become unreadable, or its links differ from the links of the robot.
@@ -171,7 +171,7 @@ def _read(
 
 
 def _color(material: ET.Element | None, named: Mapping[str, ET.Element]) -> tuple[float, ...] | None:
-    """Return the color of a shape, its own or a named material's; ``None`` without a color that can be read."""
+    """Return the color of a shape or of its named material; ``None`` without a valid color."""
     for tag in () if material is None else (material, named.get(material.get("name", ""))):
         color = None if tag is None else tag.find("color")
         if color is not None:
@@ -191,7 +191,7 @@ def _numbers(text: str, count: int, where: str) -> list[float]:
 
 
 def _find_mesh(text: str, urdf: Path, folders: Sequence[Path]) -> Path:
-    """Return the file of a mesh; a ``package://`` path is relative to a package folder or a folder above the URDF."""
+    """Return the file of a mesh; ``package://`` paths start from a package folder or a folder above the URDF."""
     scheme, colon, rest = text.partition("://")
     if scheme == "file":
         paths = [Path(unquote(rest))]

@@ -1,4 +1,4 @@
-"""Coordinates of the configuration space that an optimizer uses."""
+"""Coordinates of the configuration space, for optimization."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ class JointSlot:
 class Chart:
     """Chart ``x`` of the configuration space: like ``q``, but an angle replaces each pair of cosine and sine.
 
-    A quaternion stays four numbers; :meth:`norms` contains the equation for its unit norm.  The function ``q(x)`` is
-    therefore smooth and has no singular point.
+    A quaternion keeps its four numbers, and :meth:`norms` is the equation of its unit norm.  ``q(x)`` is therefore
+    smooth and has no singularities.
     """
 
     def __init__(self, model: pin.Model) -> None:
         self.slots: list[JointSlot] = []
-        # Pairs of indices in q and x: of numbers that are equal, and of each cosine in q (followed by its sine) and
-        # its angle in x.
+        # Index pairs (in q, in x).  copied: equal numbers.  angles: a cosine in q, which its sine follows, and the
+        # angle in x.
         copied: list[tuple[int, int]] = []
         angles: list[tuple[int, int]] = []
         start = 0
@@ -69,10 +69,7 @@ class Chart:
 
     @cached_property
     def bounded(self) -> tuple[list[int], list[int]]:
-        """Indices in ``v`` and in ``x`` of the coordinates that can have limits.
-
-        The entry of ``v`` is the time derivative of the coordinate.
-        """
+        """Indices in ``v`` and in ``x`` of the coordinates that can have limits; ``v`` is the time derivative."""
         slots = [slot for slot in self.slots if slot.kind.family in BOUNDED]
         in_v = [k for slot in slots for k in range(slot.v.start, slot.v.stop)]
         return in_v, [k for slot in slots for k in range(slot.x.start, slot.x.stop)]
@@ -111,7 +108,7 @@ class Chart:
         return np.asarray(pin.normalize(self._model, q))
 
     def bounds(self) -> tuple[Array, Array]:
-        """Return lower and upper limits of the chart coordinates; infinite for a coordinate without a limit."""
+        """Return lower and upper limits of the chart coordinates, shape (nx,); infinite without a limit."""
         lower, upper = np.full(self.nx, -np.inf), np.full(self.nx, np.inf)
         for slot in self.slots:
             if slot.kind.family in BOUNDED:

@@ -1,4 +1,4 @@
-"""Joint types of the URDF parser of Pinocchio: transform, orientation and motion subspace as expressions."""
+"""Joint types that occur in URDFs: transform, orientation and motion subspace as CasADi expressions."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from impact_posture.dynamics.spatial import Spin, constant, quaternion_matrix, skew, template
 from impact_posture.errors import UnsupportedJoint
 
-# Short name of a Pinocchio joint model, without "JointModel" → family of the joint.
+# Name of a Pinocchio joint type, without "JointModel" → family of the joint.
 _FAMILIES = {
     **dict.fromkeys(("RX", "RY", "RZ", "RevoluteUnaligned"), "revolute"),
     **dict.fromkeys(("RUBX", "RUBY", "RUBZ", "RevoluteUnboundedUnaligned"), "continuous"),
@@ -25,7 +25,7 @@ _TURNING, _QUATERNION = ("revolute", "continuous", "planar"), ("free-flyer", "sp
 
 @dataclass(frozen=True)
 class JointKind:
-    """Kind of a ``pin.JointModel``.
+    """Type of a joint.
 
     Attributes:
         family: ``revolute``, ``continuous``, ``prismatic``, ``free-flyer``, ``planar``, ``spherical`` or

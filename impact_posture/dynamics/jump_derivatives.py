@@ -1,18 +1,18 @@
 """First and second derivatives of the equations of a velocity jump, in closed form.
 
-The equations of a jump ``a`` with impulses ``f`` on the feet, in the axes of the feet, are ``M a − J_sᵀf`` and ``J_s
-a + εf``.  Their sum with multipliers ``b`` and ``l`` is ``φ = bᵀM a − bᵀJ_sᵀf + lᵀJ_s a + ε lᵀf``.  All vectors in
-this module are in the axes of a root link (a link whose parent is the world).  The inertia of a subtree is then the
-sum of the inertias of its links.  A motion of joint j turns all links after this joint by ``S_j ×``.  Relative to
-these links, their velocities for ``a`` change by ``U_j(a) = −S_j × V_p(a)``, where p is the parent of j.  The
-derivatives are::
+The left sides of the equations of a velocity jump ``a`` with foot impulses ``f`` are ``M a − J_sᵀf`` and ``J_s a +
+εf``.  Their sum with multipliers ``b`` and ``l`` is ``φ = bᵀM a − bᵀJ_sᵀf + lᵀJ_s a + ε lᵀf``.  All vectors in this
+module are in the axes of a root link, which is a link whose parent is the world.  Therefore the inertia of a subtree
+is the sum of the inertias of its links.  A motion of joint j turns all links after joint j by ``S_j ×``.  In link
+axes, their velocities for ``a`` change by ``U_j(a) = −S_j × V_p(a)``, where p is the parent of j.  The derivatives
+are::
 
     ∂φ/∂q_j       = U_j(b)ᵀF_j(a) + U_j(a)ᵀF_j(b)
     ∂²φ/∂q_j∂q_k  = U_j(b)ᵀA_k(a) + U_j(a)ᵀA_k(b),   A_k = S_k ×* F_k + I_k U_k,   for k in the subtree of j
 
 ``I_k`` is the inertia of the subtree of k.  ``F_k(a)`` is the momentum of this subtree for the velocity a, minus the
-impulses ``f`` on its feet.  ``F_k(b)`` is the momentum of the subtree for the velocity b, plus ``l``.  For standing
-robots, automatic differentiation needs about twice as many operations.
+impulses ``f`` on its feet.  ``F_k(b)`` is the momentum of the subtree for the velocity b, plus ``l``.  Automatic
+differentiation needs about twice as many operations for standing robots.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ _ONE_AXIS = ("revolute", "continuous", "prismatic")
 
 @dataclass(frozen=True, eq=False)
 class Foot:
-    """A point of a link that stays in place.
+    """A point of a link that does not move during an impact.
 
     Attributes:
-        point: The point.  Velocity and impulse of the foot are in the axes of the frame of this point.
+        point: The point.  Velocity and impulse of the foot are in the axes of its frame.
         rows: Number of velocity entries that stay zero: 3 (linear), or 6 (linear and angular).
     """
 
@@ -47,17 +47,14 @@ class Foot:
 
 @dataclass(frozen=True, eq=False)
 class _Motion:
-    """Matrices with the columns ``U_j`` (``turned``) and ``A_j`` (``changed``) for one velocity, shape (6, joints).
-
-    There is one column for every joint that is not a root.
-    """
+    """Matrices with the columns ``U_j`` (``turned``) and ``A_j`` (``changed``) of all joints except root joints."""
 
     turned: ca.SX
     changed: ca.SX
 
 
 class JumpDerivatives:
-    """Derivatives of the equations of velocity jumps at the configuration of a tree without extra inertias."""
+    """Derivatives of the jump equations at the configuration of ``tree``, which must have no extra inertias."""
 
     def __init__(self, tree: Kinematics, feet: Sequence[Foot]) -> None:
         self._tree, self._feet = tree, tuple(feet)
@@ -76,9 +73,8 @@ class JumpDerivatives:
     def of(self, a: ca.SX, f: ca.SX, b: ca.SX, multipliers: ca.SX, compliance: float) -> tuple[ca.SX, ca.SX]:
         """Return the Jacobian of the equations and the Hessian of ``φ``.
 
-        The variables are chart coordinates, ``a`` and ``f``, in this order.  ``f`` contains the impulses of
-        all feet, each in the axes of its foot.  ``b`` are the multipliers of ``M a − J_sᵀf``, and ``multipliers`` the
-        multipliers ``l`` of ``J_s a + εf``.  ``compliance`` is ε, 1/kg.
+        The variables are the chart coordinates, ``a`` and ``f``, in this order.  ``f`` stacks the impulses of all
+        feet in the axes of their frames.  ``multipliers`` is ``l``, and ``compliance`` is ε, 1/kg.
         """
         under_a, under_b = self._motion(a, -f), self._motion(b, multipliers)
         nx, others = self._tree.chart.nx, a.numel() + f.numel()
@@ -96,9 +92,9 @@ class JumpDerivatives:
         )
 
     def _lies_on(self, ends: Sequence[int], joints: Sequence[int], *, itself: bool = True) -> Array:
-        """Return an array that is True if a joint (column) is on the path from its root to an end (row).
+        """Return whether each joint (column) is on the path from the root to each end joint (row).
 
-        An end is on its own path only if ``itself``.
+        ``itself`` decides whether an end joint is on its own path.
         """
         paths = {end: {int(i) for i in self._tree.model.supports[end]} - (set() if itself else {end}) for end in ends}
         return np.array([[joint in paths[end] for joint in joints] for end in ends], dtype=bool)
@@ -111,13 +107,13 @@ class JumpDerivatives:
         return ca.tril2symm(below) + ca.diag(self._tree.armature)
 
     def _of_momentum(self, motion: _Motion) -> ca.SX:
-        """Return the derivative of ``M x``, including the impulses on the feet, shape (nv, joints)."""
+        """Return the derivative of ``M x`` minus the forces of the foot impulses, shape (nv, joints)."""
         below = _kept(self._momenta.T @ motion.turned, self._lies_on(self._of_v, self._of_u))
         above = _kept(motion.changed.T @ self._subspaces, self._lies_on(self._of_u, self._of_v, itself=False))
         return below + above.T
 
     def _at_feet(self, motions: ca.SX, joints: Sequence[int]) -> ca.SX:
-        """Return the velocities of the feet if the links after each joint have the velocities ``motions``."""
+        """Return foot velocities: column j is for links after joint j that move with column j of ``motions``."""
         rows = [ca.SX(0, len(joints))]
         for foot, X in zip(self._feet, self._foot_motions, strict=True):
             rows.append(_kept(X @ motions, np.tile(self._lies_on([foot.point.joint], joints), (foot.rows, 1))))
@@ -166,7 +162,7 @@ class JumpDerivatives:
 
     @cached_property
     def _foot_motions(self) -> list[ca.SX]:
-        """Matrix of each foot that maps the velocity of its link to the velocity of the foot, shape (rows, 6)."""
+        """Matrices, shape (rows, 6), from the velocity of a link to the velocity of the foot on this link."""
         motions = []
         for foot in self._feet:
             R, p = self._places[foot.point.joint]
@@ -176,7 +172,7 @@ class JumpDerivatives:
         return motions
 
     def _motion(self, x: ca.SX, impulses: ca.SX) -> _Motion:
-        """Return ``U`` and ``A`` for the generalized velocity ``x``; ``impulses`` on the feet add to the momenta."""
+        """Return ``U`` and ``A`` for the generalized velocity ``x``, with ``impulses`` added to the momenta."""
         velocities: ByJoint = {}
         forces: ByJoint = {}
         turned: ByJoint = {}
@@ -201,7 +197,7 @@ class JumpDerivatives:
 
 
 def _kept(matrix: ca.SX, pattern: Array) -> ca.SX:
-    """Remove the entries of a matrix for which the pattern is False."""
+    """Remove the entries of a matrix where the pattern is False."""
     return matrix * ca.sparsify(ca.SX(pattern.astype(float)))
 
 
@@ -214,10 +210,7 @@ def _motion_of_link(R: ca.SX, p: ca.SX, motion: ca.SX) -> ca.SX:
 
 @template
 def _inertia_of_link(R: ca.SX, p: ca.SX, mass: ca.SX, lever: ca.SX, inertia: ca.SX) -> ca.SX:
-    """Return ``[I h; hᵀ m]`` with ``h = m c`` and ``I`` about the origin of the root link.
-
-    The argument ``inertia`` is about the center of mass.
-    """
+    """Return ``[I h; hᵀ m]``, ``h = m c``, ``I`` about the origin of the root link, and ``inertia`` about ``c``."""
     c = p + R @ lever
     h = mass * c
     about_root = symmetric(R @ symmetric(inertia) @ R.T + ca.dot(h, c) * ca.SX.eye(3) - h @ c.T)

@@ -1,4 +1,4 @@
-"""Kinematics of the tree at one symbolic configuration: placements of links, points and frames."""
+"""Placements of links, points and frames of a robot at a symbolic configuration."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from impact_posture.dynamics.repeated_limbs import RepeatedLimbs
 from impact_posture.dynamics.spatial import constant, quaternion_product, transposed_times
 from impact_posture.robot.model_joints import finite_armature
 
-# Joint index → spatial inertia, force or motion of its link.
+# Joint index → quantity of the link that the joint moves, such as its inertia, force or velocity.
 ByJoint = dict[int, ca.SX]
 
 
 @dataclass(frozen=True)
 class PointOnLink:
-    """A point, with the axes of a frame, that is fixed to a link.
+    """A point and the axes of a frame, both fixed to a link.
 
     Attributes:
         joint: Index of the joint that moves the link.
@@ -44,12 +44,11 @@ class PointOnLink:
 class Kinematics:
     """Kinematics of a ``pin.Model`` at the configuration ``q``, shape (nq, 1).
 
-    The model can have all joint types that the URDF parser of Pinocchio creates.  A joint with infinite armature is
-    locked and does not move in an impact; ``locked`` contains the velocity entries of locked joints.
-    ``extra_inertia`` contains constant 6×6 inertias by joint index, in link coordinates, which are added to the
-    inertias of the model.  For example, a foot on a support with compliance ε has the extra point mass 1/ε.  With
-    ``limbs``, parameters replace the constants in which repeated limbs differ.  ``chart_x`` are the chart coordinates
-    of ``q``; only :attr:`quaternions` needs them.
+    A joint with infinite armature is locked and does not move in an impact.  ``locked`` contains the velocity entries
+    of locked joints.  ``extra_inertia`` maps joint indices to constant 6×6 inertias in link coordinates, which are
+    added to the inertias of the model.  For example, a foot with compliance ε gets the point mass 1/ε.  With
+    ``limbs``, parameters replace the constants that differ between repeated limbs.  ``chart_x`` contains the chart
+    coordinates of ``q``, which only :attr:`quaternions` needs.
     """
 
     def __init__(
@@ -88,11 +87,11 @@ class Kinematics:
         self.locked = tuple(int(k) for k in np.flatnonzero(locked))
 
     def _constant(self, joint: int, tag: str, of: Callable[[int], ArrayLike]) -> ca.SX:
-        """Return a constant of a joint; parameters replace the numbers in which repeated limbs differ."""
+        """Return a constant of a joint, with parameters for the numbers that differ between repeated limbs."""
         return constant(of(joint)) if self.limbs is None else self.limbs.constant(joint, tag, of)
 
     def by_joint(self, tag: str, values: NDArray[np.float64]) -> ca.SX:
-        """Return one constant per degree of freedom, shape (nv,), as an expression; ``tag`` names the constant."""
+        """Return ``values``, one per degree of freedom, as an expression; ``tag`` names the kind of constant."""
         slots = self.chart.slots
         parts = [self._constant(s.index, tag, lambda j: values[slots[j - 1].v]) for s in slots]
         return ca.densify(ca.vertcat(*parts))
@@ -127,7 +126,7 @@ class Kinematics:
         return quaternions
 
     def relative(self, base: int, joint: int) -> tuple[ca.SX, ca.SX]:
-        """Return rotation (3, 3) and origin (3,) of a link in the coordinates of the link ``base``.
+        """Return rotation (3, 3) and origin (3,) of the link ``joint`` in the coordinates of the link ``base``.
 
         The expressions depend only on the joints between the two links.
         """
@@ -136,7 +135,7 @@ class Kinematics:
         return R_base.T @ R, R_base.T @ (p - p_base)
 
     def _below(self, base: int, joint: int) -> tuple[ca.SX, ca.SX]:
-        """Return the placement of a link in the coordinates of its ancestor ``base``."""
+        """Return the placement of the link ``joint`` in the coordinates of its ancestor ``base``."""
         if joint == base:
             return ca.SX.eye(3), ca.SX.zeros(3)
         if (base, joint) not in self._placed:
@@ -167,7 +166,7 @@ class Kinematics:
         return ca.densify(moments[0] / masses[0])
 
     def to_link(self, joint: int, direction: ca.SX) -> ca.SX:
-        """Rotate a world direction into link coordinates, joint by joint from the root to the link."""
+        """Rotate a world direction into link coordinates."""
         for i in list(self.model.supports[joint])[1:]:
             direction = transposed_times(self._R[i], direction)
         return direction

@@ -1,7 +1,7 @@
 """Build a MuJoCo model from a ``pin.Model``, with the same bodies, joints, inertias and armature.
 
-The URDF reader of MuJoCo is not used, because it loses package paths, the floating base and the armature, and
-changes the order of joints.  The model has no geometry.  A simulation adds shapes with :meth:`Mjcf.add_geom` and
+The URDF reader of MuJoCo is not used.  It loses package paths, the floating base and the armature, and changes the
+order of joints.  The model has no geometry.  A simulation adds shapes with :meth:`Mjcf.add_geom` and
 :meth:`Mjcf.add_plane`.
 """
 
@@ -26,7 +26,7 @@ Geom = Literal["sphere", "box", "plane"]
 
 # Joint index of the world.
 WORLD = 0
-# MuJoCo rejects a moving body whose mass (kg) or moment of inertia (kg m²) is smaller.
+# Smallest mass (kg) and moment of inertia (kg m²) of a moving body that MuJoCo accepts.
 _LEAST = 1e-15
 # With these options MuJoCo does not change inertias and does not merge bodies.
 _COMPILER = {
@@ -51,9 +51,8 @@ class Mjcf:
         bodies: Index of a Pinocchio joint → name of the body that the joint moves.
         joints: Index of a Pinocchio joint → names of the MuJoCo joints that represent it.
         sites: Index of a frame → name of its site.  If several frames have the same name, only one has a site.
-        moments: Body name → principal moments of inertia, kg·m², shape (3,), that violate the triangle inequality.
-            MuJoCo rejects moments that violate it, so the spec has the nearest valid moments, and :meth:`compile`
-            sets the exact moments.
+        moments: Body name → principal moments of inertia, kg·m², shape (3,), that MuJoCo rejects.  The spec contains
+            the nearest accepted moments, and :meth:`compile` sets the exact moments.
     """
 
     spec: Any
@@ -81,7 +80,7 @@ class Mjcf:
         )
 
     def add_plane(self, name: str, point: Array, normal: Array) -> None:
-        """Add an infinite plane to the world; ``point`` and unit ``normal`` are in world axes, shape (3,)."""
+        """Add an infinite plane to the world through ``point`` with unit ``normal``, in world axes, shape (3,)."""
         upright = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), np.array(normal)).matrix()
         self.add_geom(WORLD, name, "plane", (1.0, 1.0, 1.0), pin.SE3(upright, np.array(point)))
 
@@ -118,12 +117,12 @@ def pose(placement: pin.SE3) -> dict[str, Array]:
 def build_mjcf(model: pin.Model, name: str = "robot") -> Mjcf:
     """Build the MuJoCo model of a Pinocchio model.
 
-    Each body is named after the link at its origin; if there is none, after its joint.  Every frame becomes a site
-    with the name of the frame.  If a link and a joint have the same name, the site is at the frame of the link.  A
-    free-flyer whose parent is the world becomes a free joint, and any other free-flyer becomes three slides and a
-    ball.  A planar joint becomes two slides and a hinge, and a translation becomes three slides.  A body without mass
-    gets the least mass and moments of inertia that MuJoCo accepts, 1e-15.  The model has no friction, damping or
-    effort limits, because the dynamics of Pinocchio do not include them.
+    A body has the name of the link at its origin, or else the name of its joint.  Every frame becomes a site with the
+    name of the frame.  If a link and a joint have the same name, the site is at the frame of the link.  A free-flyer
+    whose parent is the world becomes a free joint.  Any other free-flyer becomes three slides and a ball.  A planar
+    joint becomes two slides and a hinge, and a translation becomes three slides.  A body without mass gets the
+    smallest mass and moments of inertia that MuJoCo accepts.  The model has no friction, damping or effort limits,
+    because the dynamics of Pinocchio do not include them.
 
     Raises:
         UnsupportedJoint: The joint type cannot occur in a URDF.
@@ -152,7 +151,7 @@ def build_mjcf(model: pin.Model, name: str = "robot") -> Mjcf:
 
 
 def _depth_first(model: pin.Model) -> list[int]:
-    """Return the joint indices in depth-first order, in which MuJoCo numbers bodies."""
+    """Return the joint indices in depth-first order, as MuJoCo numbers bodies."""
     order, waiting = [], [WORLD]
     while waiting:
         order.append(waiting.pop())
@@ -161,17 +160,14 @@ def _depth_first(model: pin.Model) -> list[int]:
 
 
 def _is_free(model: pin.Model, slot: JointSlot) -> bool:
-    """Return whether a joint can become a MuJoCo free joint.
-
-    The parent of the joint must be the world, and all six axes must have the same armature.
-    """
+    """Return whether a joint is a free-flyer on the world with equal armatures, so that a MuJoCo free joint fits."""
     if slot.kind.family != "free-flyer" or model.parents[slot.index] != 0:
         return False
     return bool(np.ptp(np.asarray(model.armature)[slot.v]) == 0)
 
 
 def _link_name(model: pin.Model, joint: int) -> str:
-    """Return the name of the link whose frame equals the joint frame; if there is none, the name of the joint."""
+    """Return the name of the link whose frame equals the joint frame, or else the name of the joint."""
     for frame in model.frames:
         if frame.parentJoint == joint and frame.type == pin.FrameType.BODY and frame.placement.isIdentity(1e-12):
             return str(frame.name)
@@ -227,20 +223,14 @@ def _add_joints(body: Any, model: pin.Model, slot: JointSlot, free: bool, taken:
 
 
 def _alike(armature: Array, slot: JointSlot) -> None:
-    """Raise InputError if axes that need the same armature in MuJoCo have different armatures.
-
-    The axes of a ball need the same armature, and so do slides whose directions turn with a rotation.
-    """
+    """Raise InputError if the axes of a ball, or the slides before a rotation, have different armatures."""
     if armature.size and np.ptp(armature) > 0:
         what = f"the armature of joint '{slot.name}' differs between its axes"
         raise InputError(what, where="MJCF", hint="give all axes of the joint the same armature")
 
 
 def _inertia(inertia: pin.Inertia) -> tuple[dict[str, Any], Array | None]:
-    """Return the arguments of ``add_body`` for an inertia.
-
-    Also return the exact principal moments if MuJoCo rejects them; otherwise ``None``.
-    """
+    """Return the arguments of ``add_body`` for an inertia, and the principal moments if MuJoCo rejects them."""
     moments, axes = np.linalg.eigh(np.array(inertia.inertia))
     if np.linalg.det(axes) < 0:
         axes[:, 0] = -axes[:, 0]
@@ -268,7 +258,7 @@ def _add_sites(elements: dict[int, Any], model: pin.Model) -> dict[int, str]:
 
 @contextmanager
 def unwarned() -> Iterator[None]:
-    """Prevent MuJoCo from writing warnings to a log file in the working directory; the state shows the problem."""
+    """Prevent MuJoCo from writing warnings to a log file in the working directory."""
     mujoco = import_mujoco()
     before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda message: None)

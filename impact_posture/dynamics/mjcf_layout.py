@@ -32,8 +32,8 @@ class MjcfSlot:
         qpos: Entries of the joint in ``qpos``.
         qvel: Entries of the joint in ``qvel``.
         placement: Placement of the rest frame of the joint in its parent.
-        moved: Whether the joint is a MuJoCo free joint whose rest frame is not the world frame.  MuJoCo states pose
-            and linear velocity of a free joint in world axes, but of slides and a ball in the rest frame.
+        moved: Whether the joint is a MuJoCo free joint whose rest frame is not the world frame.  MuJoCo gives the
+            pose and linear velocity of a free joint in the world, but positions of slides in the rest frame.
     """
 
     joint: JointSlot
@@ -55,8 +55,8 @@ class MjcfLayout:
         self._chart = chart = Chart(model)
         self.nqpos, self.nv, self.nq = chart.nx, chart.nv, chart.nq
         self.slots: list[MjcfSlot] = []
-        # For each entry of qpos, the index of the chart coordinate with the same value.  For each entry of qvel, the
-        # index in v.
+        # places: index of the chart coordinate with the same value as each entry of qpos.  rates: index in v of each
+        # entry of qvel.
         places: list[int] = []
         rates: list[int] = []
         for i in order:
@@ -70,8 +70,8 @@ class MjcfLayout:
             self.slots.append(MjcfSlot(joint, *ends, place, moved))
             places += x
             rates += v
-        # A simulation converts the state in every tick.  To be fast, all joints are converted by one permutation;
-        # only poses in another frame and linear velocities are converted separately.
+        # For speed, a permutation converts all joints at once.  Only poses relative to another frame and linear
+        # velocities are converted joint by joint.
         self._places, self._permutation = np.array(places, dtype=int), np.eye(self.nv)[rates]
         self._rates = np.argsort(rates)
         self._moved = [slot for slot in self.slots if slot.moved]
@@ -79,11 +79,10 @@ class MjcfLayout:
 
     @property
     def places(self) -> tuple[NDArray[np.int_], NDArray[np.int_]] | None:
-        """Return the index in ``qpos`` of each entry of ``q``, and the index in ``qvel`` of each entry of ``v``.
+        """Index in ``qpos`` of each entry of ``q``, and index in ``qvel`` of each entry of ``v``.
 
-        These indices define the conversion if the model has only hinges and slides, with or without a floating base.
-        In addition, the quaternion of the base must be normalized, and its linear velocity rotated.  Return ``None``
-        for a model with other joints.
+        For a floating base, the quaternion must also be normalized, and the linear velocity rotated.  The value is
+        ``None`` for a model with joints that are not hinges or slides.
         """
         base = len(self._turning)
         # If no joint has a cosine and a sine in q, the chart coordinates equal q.
@@ -127,7 +126,7 @@ class MjcfLayout:
 
     def state(self, qpos: Array, qvel: Array) -> tuple[Array, Array]:
         """Convert ``qpos`` and ``qvel`` to the Pinocchio configuration, shape (nq,), and velocity, shape (nv,)."""
-        # A simulation calls this method in every tick.  To be fast, the method does not compute the matrix T.
+        # For speed, this method does not compute the matrix T, because simulations call it in every tick.
         q, v = self.q(qpos), qvel[self._rates]
         for slot in self._turning:
             turn = _turn(slot, q[slot.joint.q])
@@ -137,10 +136,7 @@ class MjcfLayout:
 
 
 def _turn(slot: MjcfSlot, piece: Array) -> Array:
-    """Return the rotation of the linear velocity of a free-flyer or planar joint from Pinocchio to MuJoCo axes.
-
-    ``piece`` contains the entries of the joint in ``q``.
-    """
+    """Return the rotation of linear velocities from Pinocchio to MuJoCo axes; ``piece`` is the part of ``q``."""
     if slot.joint.kind.family == "planar":
         return np.array([[piece[2], -piece[3]], [piece[3], piece[2]]])
     R = pin.Quaternion(np.array(piece[3:])).matrix()

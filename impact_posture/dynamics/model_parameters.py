@@ -1,4 +1,4 @@
-"""Replace constants of a model by parameters in expressions, so models that differ in these constants share code."""
+"""Replace constants of a model by parameters, so that models with different constants share expressions."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from impact_posture.system.arrays import Array
 
 
 class ModelParameters(RepeatedLimbs):
-    """Parameters for the nonzero armatures and joint positions of a model; repeated limbs are not used.
+    """Parameters for the nonzero armatures and joint positions of a model, without repeated limbs.
 
     Attributes:
-        symbol: Symbol of all parameters, shape (n, 1), with n ≥ 1.
+        symbol: CasADi symbol that stacks all parameters, shape (n, 1), with n ≥ 1.
         values: Values of the parameters, shape (n,).
     """
 
@@ -40,13 +40,13 @@ class ModelParameters(RepeatedLimbs):
                 count += 1
 
     def constant(self, joint: int, tag: str, of: Callable[[int], ArrayLike]) -> ca.SX:
-        """Return a constant of a joint as an expression; parameters replace its armature and its position."""
+        """Return a constant of a joint as an expression, with parameters for armature and position."""
         parameters = self._parameters.get((joint, tag))
         return constant(of(joint)) if parameters is None else parameters
 
 
 def without_parameters(robot: Robot) -> Robot:
-    """Return the robot with all nonzero parameters set to one, so that robots that share code are equal."""
+    """Return the robot with one in place of all nonzero parameters.  Robots with equal results share code."""
     model, armature = robot.model.copy(), np.array(robot.model.armature)
     finite = np.isfinite(armature)
     armature[finite] = rounded(armature[finite]) != 0.0

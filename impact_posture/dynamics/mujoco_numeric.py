@@ -13,8 +13,8 @@ from impact_posture.system.arrays import Array
 class MujocoNumeric:
     """Compute dynamics of a ``pin.Model`` with MuJoCo at one configuration.
 
-    Call :meth:`at` first; the other methods use the configuration that was passed to it.  All vectors and matrices
-    are in the order and tangent space of Pinocchio.
+    The method :meth:`at` sets the configuration and must be called first.  All vectors and matrices are in the order
+    and tangent space of Pinocchio.
 
     Raises:
         InputError: MuJoCo is not installed.

@@ -1,7 +1,7 @@
 """Repeated limbs: limbs of a robot with the same joints, for example the two legs of a humanoid.
 
-The expressions of repeated limbs differ only in constants.  If parameters replace these constants, all limbs have the
-same instructions.  A processor can then compute several limbs at once, one per SIMD lane.
+The expressions of repeated limbs differ only in constants.  If parameters replace these constants, the same
+instructions compute all limbs.  A processor then computes several limbs at once, one per SIMD lane.
 """
 
 from __future__ import annotations
@@ -18,15 +18,16 @@ from impact_posture.dynamics.joints import joint_kind
 from impact_posture.dynamics.spatial import constant, rounded
 from impact_posture.robot.model_joints import finite_armature
 
-# If a constant is zero in one limb but not in another, both limbs compute with it.  Limbs are repeated only if this
-# increases the number of constants at most by this factor.
+# A constant that is zero in only one of two limbs costs operations in both limbs.  Limbs are repeated only if the
+# number of nonzero constants increases by at most this factor.
 _FILL = 1.25
+# Numbers of SIMD lanes, in order of preference.
 _WIDTHS = (4, 2)
 
 
 @dataclass(frozen=True)
 class Place:
-    """Position of a joint in repeated limbs.  All numbers start at zero.
+    """Position of a joint in repeated limbs.  Numbers start at zero.
 
     Attributes:
         group: Number of the group of limbs that repeat each other.
@@ -44,7 +45,7 @@ class RepeatedLimbs:
 
     Attributes:
         groups: Groups of limbs; each limb is a tuple of joint indices, in the same order for all limbs of a group.
-        places: Joint index → its place.  Joints outside repeated limbs have no entry.
+        places: Joint index → :class:`Place`, for joints in repeated limbs.
         parameters: (group, lane, name) → symbol and value of a parameter.  The name is the same for all lanes.
     """
 
@@ -59,18 +60,15 @@ class RepeatedLimbs:
         self.parameters: dict[tuple[int, int, str], tuple[ca.SX, float]] = {}
 
     def counterparts(self, joint: int) -> list[int]:
-        """Return the joints that correspond to this joint in all repeated limbs, one per lane.
-
-        If the joint is in no repeated limb, return only the joint.
-        """
+        """Return the joints at the same position in all limbs of the group, or only ``joint`` outside of limbs."""
         place = self.places.get(joint)
         return [joint] if place is None else [limb[place.position] for limb in self.groups[place.group]]
 
     def constant(self, joint: int, tag: str, of: Callable[[int], ArrayLike]) -> ca.SX:
         """Return ``of(joint)`` as an expression.
 
-        An entry becomes a parameter if the corresponding joints of other limbs have another value.  ``of`` returns a
-        vector or a matrix; a symmetric matrix stays symmetric.  ``tag`` is a name for the kind of constant.
+        An entry becomes a parameter if it differs between the limbs of the group.  ``of`` returns a vector or a
+        matrix; a symmetric matrix stays symmetric.  ``tag`` names the kind of constant.
         """
         place = self.places.get(joint)
         if place is None:
@@ -83,7 +81,7 @@ class RepeatedLimbs:
             entries = [d[i, j] for d in dense]
             if len(set(entries)) > 1:
                 row, column = (min(i, j), max(i, j)) if symmetric else (i, j)
-                # The name includes the values, because another kernel may use the same tag for other values.
+                # The name includes the values, because the same tag may be used with different values.
                 name = f"{place.position}.{tag}.{row}.{column}.{entries}"
                 expression[i, j] = self._parameter(place, name, float(numbers[i, j]))
             elif entries[0] != 0.0:
@@ -91,7 +89,7 @@ class RepeatedLimbs:
         return expression
 
     def indicator(self, joint: int, of: int) -> ca.SX:
-        """Return a parameter that is one if ``joint`` is ``of``, and zero for the corresponding joints."""
+        """Return a parameter that is one in the lane of the joint ``of``, and zero in the other lanes."""
         place = self.places[of]
         return self._parameter(self.places[joint], f"{place.position}.on.{place.lane}", float(joint == of))
 
@@ -103,7 +101,7 @@ class RepeatedLimbs:
 
 
 def _groups(model: pin.Model) -> tuple[tuple[tuple[int, ...], ...], ...]:
-    """Return the groups of repeated limbs.  A limb is a whole subtree; it is not searched for smaller limbs."""
+    """Return the groups of repeated limbs.  A limb is a whole subtree."""
     groups: list[tuple[tuple[int, ...], ...]] = []
     waiting = [0]
     while waiting:
@@ -130,11 +128,7 @@ def _limb(model: pin.Model, root: int) -> tuple[int, ...]:
 
 
 def _alike(model: pin.Model, first: tuple[int, ...], second: tuple[int, ...]) -> bool:
-    """Return whether two limbs can be computed together.
-
-    The limbs must have the same joints in the same order, and nearly the same zero entries in placements and
-    inertias.
-    """
+    """Return whether two limbs have the same joint types, and nearly the same zeros in placements and inertias."""
     if _joints(model, first) != _joints(model, second):
         return False
     pairs = [[_numbers(model, k) != 0.0 for k in pair] for pair in zip(first, second, strict=True)]

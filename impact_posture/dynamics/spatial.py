@@ -22,9 +22,9 @@ Result = TypeVar("Result", ca.SX, tuple[ca.SX, ...])
 def template(operation: Callable[P, Result]) -> Callable[P, Result]:
     """Decorate an operation so that its expressions are built only once for each size of arguments.
 
-    A tree applies a few operations to every joint, and building their expressions from Python would take most of the
-    time.  On later calls, CasADi inserts the arguments into the stored expressions, and simplifies products with
-    zeros and ones.  The arguments of ``operation`` are ``SX`` matrices, and keyword arguments for options.  It
+    The dynamics apply the same operations to every joint, and building expressions in Python is slow.  Later calls
+    insert the arguments into the stored expressions, and CasADi simplifies products with zeros and ones.  The
+    positional arguments of ``operation`` are ``SX`` matrices, and keyword arguments are options.  ``operation``
     returns a matrix or a tuple of matrices.
     """
     functions: dict[tuple[object, ...], ca.Function] = {}
@@ -109,10 +109,7 @@ class Spin:
 
 
 def _turned(M: ca.SX, k: int, cosine: ca.SX, sine: ca.SX) -> ca.SX:
-    """Return ``R M Rᵀ`` for a rotation ``R`` about axis ``k`` and a 3×3 matrix ``M``.
-
-    This takes 16 products, or 12 if ``M`` is symmetric.
-    """
+    """Return ``R M Rᵀ`` for a rotation ``R`` about axis ``k`` and a 3×3 matrix ``M``, with few products."""
     i, j = (k + 1) % 3, (k + 2) % 3
     # The symmetric part of the 2×2 block transforms with twice the angle.
     c2, s2 = (cosine - sine) * (cosine + sine), 2 * sine * cosine
@@ -142,8 +139,7 @@ def spin_power(inertia: ca.SX, x: ca.SX, y: ca.SX, *, axis: int, sense: float) -
 def inertia_to_parent(inertia: ca.SX, R: ca.SX, p: ca.SX, *spin: ca.SX, axis: int | None = None) -> ca.SX:
     """Return a symmetric 6×6 inertia of a child in the coordinates of its parent.
 
-    ``spin`` contains the cosine and sine of a rotation about the coordinate ``axis`` 0, 1 or 2; this rotation is
-    applied before ``R``.
+    ``spin`` contains the cosine and sine of a rotation about the coordinate ``axis`` 0, 1 or 2, before ``R``.
     """
     blocks = [symmetric(inertia[:3, :3]), inertia[:3, 3:], symmetric(inertia[3:, 3:])]
     if axis is not None:

@@ -1,7 +1,7 @@
-"""Dynamics of the kinematic tree at one symbolic configuration, by an articulated-body factorization in O(n).
+"""Dynamics of a robot at a symbolic configuration, by an articulated-body factorization in O(n).
 
-All quantities are in link coordinates.  ``M`` does not depend on the pose of the base.  The pose is only needed to
-rotate world directions to link coordinates.  Notation and signs follow Featherstone, *Rigid Body Dynamics Algorithms*
+All quantities are in link coordinates.  ``M`` does not depend on the pose of the base, which only rotates world
+directions to link coordinates.  Notation and signs follow Featherstone, *Rigid Body Dynamics Algorithms*
 (2008), but the linear part is first, as in Pinocchio.
 """
 
@@ -39,8 +39,7 @@ class Wrench:
         point: The point, with the axes of its frame.
         force: The force, shape (3,), in the axes of the frame if ``in_frame``, else in world axes.
         moment: The moment about the point, shape (3,), in the same axes as the force.
-        in_frame: Whether the wrench is constant in the frame and turns with the link; otherwise constant in the
-            world.
+        in_frame: Whether the wrench is constant in the frame and turns with the link, or is constant in the world.
     """
 
     point: PointOnLink
@@ -51,13 +50,13 @@ class Wrench:
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """The response of the robot to a generalized force and wrenches.
+    """The response of the robot to a generalized force and wrenches, with spatial quantities in link coordinates.
 
     Attributes:
         a: Generalized response ``M⁻¹(τ + Σ Jᵀ w)``, shape (nv,).
-        velocities: Spatial velocity of every link for the generalized velocity ``a``, in link coordinates.
-        before: Spatial velocity ``v⁻`` of every link without the motion of its own joint, in link coordinates.
-        forces: Spatial force that acts through every joint on its link, in link coordinates.
+        velocities: Velocity of every link for the generalized velocity ``a``.
+        before: Velocity ``v⁻`` of every link without the motion of the joint that moves the link.
+        forces: Force that every joint transmits to its link.
         passed: The part of ``forces`` that does not depend on the motion of the parent link.
         wrenches: The wrenches that act on the robot.
     """
@@ -94,8 +93,8 @@ class Tree(Kinematics):
     ) -> ca.SX:
         """Return ``M(q) v − Σ Jᵀ w`` in O(n), shape (nv,), where ``w`` are the wrenches ``less``.
 
-        ``M`` includes the armature, and the extra inertias if ``extra``.  Pass ``velocities`` if the result of
-        :meth:`velocities` for ``v`` is already available.
+        ``M`` includes the armature, and the extra inertias if ``extra``.  ``velocities`` may pass the result of
+        :meth:`velocities` for ``v``.
         """
         velocities = self.velocities(v) if velocities is None else velocities
         inertia = self._inertia if extra else self._own_inertia
@@ -153,16 +152,16 @@ class Tree(Kinematics):
 
     @cached_property
     def _factor(self) -> dict[int, tuple[ca.SX, ...]]:
-        """Factors of every joint: ``(pivot, D⁻¹Uᵀ, I^a = I^A − U D⁻¹ Uᵀ)``, ``U = I^A S``, ``D = SᵀU + armature``.
+        """For every joint ``(pivot, D⁻¹Uᵀ, I^a = I^A − U D⁻¹Uᵀ)`` with ``U = I^A S``, ``D = SᵀU + armature``.
 
-        The pivot is ``1/D`` for a joint with one axis, and ``D`` for a joint with several axes.  For a locked joint,
-        ``D`` is infinite, and the pivot is ``D⁻¹ = 0``.
+        ``I^A`` is the articulated inertia of the link (Featherstone 2008, chapter 7).  The pivot is ``1/D`` for a
+        joint with one axis, ``D`` for a joint with several axes, and zero for a locked joint, whose ``D`` is infinite.
         """
         articulated = dict(self._inertia)
         factors: dict[int, tuple[ca.SX, ...]] = {}
         for slot, i, parent in reversed(self._joints):
             D = step.pivot(articulated[i], self._S[i], self.armature[slot.v])
-            # Not part of a template: so a constant D becomes the constant factor 1/D instead of a division.
+            # Computed outside the templates, so that a constant D gives a constant factor 1/D instead of a division.
             pivot = ca.SX(0) if slot.v.start in self.locked else 1 / D if slot.kind.nv == 1 else D
             factors[i] = pivot, *step.reduce(articulated[i], self._S[i], pivot)
             if parent:
@@ -172,7 +171,7 @@ class Tree(Kinematics):
     def respond(self, tau: ca.SX | None = None, wrenches: Sequence[Wrench] = ()) -> Response:
         """Solve ``M a = τ + Σ Jᵀ w`` by the articulated-body factorization in O(n), without computing ``M``.
 
-        The force through joint i is ``f_i = I^a_i v_i⁻ + p^a_i``, so no additional sweep over the tree is needed.
+        The same sweeps give the force through joint i, ``f_i = I^a_i v_i⁻ + p^a_i``.
         """
         bias: ByJoint = dict.fromkeys(self._R, _ZERO)
         for wrench in wrenches:
@@ -198,9 +197,9 @@ class Tree(Kinematics):
     def pair_gradient(self, x: Response, y: Response) -> ca.SX:
         """Return the tangent gradient of ``w_xᵀJ y + w_yᵀJ x − yᵀM x`` for fixed x, y, w_x and w_y, shape (nv,).
 
-        The gradient is ``Sᵀ(v_y⁻ ×* f_x + v_x⁻ ×* f_y)``, plus a term for wrenches that are constant in the world,
-        since they rotate relative to the links.  Insert ``f = I^a v⁻ + p^a``.  For a joint about a coordinate axis,
-        the two terms with ``I^a`` equal one product ``v_y⁻ᵀ K v_x⁻``, where ``K`` is the derivative of ``I^a`` with
+        The gradient is ``Sᵀ(v_y⁻ ×* f_x + v_x⁻ ×* f_y)`` with ``f = I^a v⁻ + p^a``.  Wrenches that are constant in
+        the world rotate relative to the links and add a term (:meth:`_turn`).  For a joint about a coordinate axis,
+        the two terms with ``I^a`` equal the product ``v_y⁻ᵀ K v_x⁻``, where ``K`` is the derivative of ``I^a`` with
         respect to the joint angle.
         """
         turning: ByJoint = {}
@@ -220,9 +219,8 @@ class Tree(Kinematics):
     def energy_gradient(self, velocities: ByJoint) -> ca.SX:
         """Return the tangent gradient of ``vᵀM(q)v`` for fixed ``v``, without extra inertias, shape (nv,).
 
-        A motion ``S_j δ`` of joint j changes the velocities of all links after this joint by ``−S_j δ ×``.  The value
-        changes by ``−2 S_jᵀ (v_j⁻ ×* F_j)``.  Here ``F_j`` is the momentum of the subtree of j, and ``v_j⁻`` the
-        velocity of its first link without the motion of joint j.
+        Entry j is ``−2 S_jᵀ (v_j⁻ ×* F_j)``.  ``F_j`` is the momentum of the subtree of joint j, and ``v_j⁻`` is the
+        velocity of the link after joint j without the motion of joint j.
         """
         forces = {i: -2 * (self._own_inertia[i] @ velocity) for i, velocity in velocities.items()}
         # For a joint with one axis, v⁻ can include the motion of the joint, because Sᵀ(S ×* F) is zero.
@@ -250,10 +248,7 @@ class Tree(Kinematics):
     def _gather(
         self, pairs: Sequence[tuple[ByJoint, ByJoint]], turning: ByJoint, known: ByJoint | None = None
     ) -> ca.SX:
-        """Return ``Σ S_jᵀ(v_j⁻ ×* F_j) − ω_jᵀ turning`` for all pairs ``(v⁻, F)``, shape (nv,).
-
-        ``known`` contains terms that are added to the rows of joints.
-        """
+        """Return ``known + Σ S_jᵀ(v_j⁻ ×* F_j) − ω_jᵀ turning``, summed over the pairs ``(v⁻, F)``, shape (nv,)."""
         turning = {i: turning.get(i, ca.SX(3, 1)) for i in self._R}
         rows: ByJoint = {}
         for slot, i, parent in reversed(self._joints):

@@ -1,4 +1,4 @@
-"""Operations at one joint in a sweep over the tree, as templates.
+"""Operations at one joint in a sweep over the kinematic tree.
 
 Notation follows Featherstone (2008).  ``S`` is the motion subspace of the joint, shape (6, nv), and ``I`` the
 articulated inertia of its link.  ``pivot`` is ``D = SᵀIS + armature``, or ``1/D`` for a joint with one axis.
@@ -19,7 +19,7 @@ def pivot(inertia: ca.SX, S: ca.SX, armature: ca.SX) -> ca.SX:
 
 @template
 def reduce(inertia: ca.SX, S: ca.SX, pivot: ca.SX) -> tuple[ca.SX, ...]:
-    """Return the gain ``D⁻¹SᵀI``, shape (nv, 6), and the inertia that acts on the parent, ``I − I S D⁻¹SᵀI``."""
+    """Return the gain ``D⁻¹SᵀI``, shape (nv, 6), and the inertia that the parent link meets, ``I − I S D⁻¹SᵀI``."""
     U = inertia @ S
     gain = _solve(pivot, U.T)
     return gain, symmetric(inertia - U @ gain)
@@ -36,7 +36,7 @@ def drive(S: ca.SX, tau: ca.SX, bias: ca.SX, gain: ca.SX) -> tuple[ca.SX, ...]:
 def respond(
     before: ca.SX, S: ca.SX, drive: ca.SX, passed: ca.SX, pivot: ca.SX, gain: ca.SX, reduced: ca.SX
 ) -> tuple[ca.SX, ...]:
-    """Return the joint rates, the velocity of the link after the joint, and the force through the joint.
+    """Return the joint velocity, the velocity of the link after the joint, and the force through the joint.
 
     ``before`` is the velocity of the link without the motion of the joint.  The other arguments are results of
     :func:`drive` and :func:`reduce`.

@@ -2,8 +2,8 @@
 
 The velocity is ``ν = [base linear, base angular, joint rates]`` with the base twist in the base frame.  The equation
 of motion of an aerial robot with an arm is ``M(q) ν̇ + h(q, ν) = G u`` with ``u = [rotor thrusts (N), joint torques
-(N·m)]``.  Generalized forces are dual to ``ν``, hence ``G`` is constant.  Its rotor columns are wrenches on the base,
-in the base frame at its origin.
+(N·m)]``.  ``G`` is constant, because ``ν`` has the base twist in the base frame.  The rotor columns of ``G`` are
+wrenches on the base, in the base frame about its origin.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ class Allocation:
     """Map from rotor thrusts to the wrench on the base."""
 
     matrix: Array
-    """6 × n: base wrench ``[force (N); moment (N·m)]`` per unit thrust (N), base frame, base origin."""
+    """Base wrench ``[force (N); moment (N·m)]`` per unit thrust (N), in the base frame, shape (6, rotors)."""
     rank: int
-    """6 for a fully actuated robot."""
+    """Rank of the matrix; 6 for a fully actuated robot."""
     condition: float
-    """Largest over smallest singular value (mixes N and N·m); infinite below rank 6."""
+    """Condition number of the matrix, whose units N and N·m are mixed; infinite if the rank is below 6."""
 
 
 @dataclass(frozen=True)
@@ -42,17 +42,17 @@ class Hover:
     thrusts: Array
     """Rotor thrusts, N."""
     speeds: Array
-    """Rotor speeds in the unit of ``speed_max``; zero where the thrust would be negative."""
+    """Rotor speeds in the unit of ``speed_max``; zero for a negative thrust."""
     joint_torques: Array
     """Torques of all joints behind the base, N·m (N for a prismatic joint)."""
     thrust_margin: float
-    """Least distance of a thrust to its limits over the width of its range: at most 0.5, negative outside."""
+    """Smallest distance of a thrust from its limits, divided by the range: at most 0.5; negative if outside."""
     torque_margin: float
-    """Least ``1 - |τ|/τ_max`` over the joints; 1 without joints."""
+    """Smallest ``1 - |τ|/τ_max`` of all joints; 1 without joints."""
     residual: float
     """Largest base force or moment (N, N·m) that the rotors leave unbalanced."""
     violations: tuple[str, ...]
-    """Reasons why the robot cannot hover in this posture, in words; empty if it can."""
+    """Reasons why the robot cannot hover in this posture; empty if it can."""
 
     @property
     def feasible(self) -> bool:
@@ -64,8 +64,8 @@ class Hover:
 class LateralForce:
     """Largest net horizontal force without tilt or rotation in each direction, N; NaN if the robot cannot hover.
 
-    The force acts through the center of mass of the robot, whose arm does not move.  Forward and left are the x and y
-    axes of the base, projected on the horizontal plane.
+    The force acts through the center of mass, and the arm does not move.  Forward and left are the x and y axes of
+    the base, projected on the horizontal plane.
     """
 
     forward: float
@@ -86,8 +86,7 @@ def thrust_limits(propulsion: PropulsionSpec) -> tuple[float, float]:
 def torque_limits(model: pin.Model) -> Array:
     """Return the largest torque of each velocity entry, N·m or N, shape (nv,).
 
-    The torque is infinite if the model states no limit (zero), for a floating base, and for a locked joint
-    (infinite armature).
+    The torque is infinite for a limit of zero (not stated), a floating base, and a locked joint (infinite armature).
     """
     limits = np.array(model.effortLimit, dtype=float)
     unknown = ~(np.isfinite(limits) & (limits > 0)) | finite_armature(model)[1]
@@ -96,11 +95,11 @@ def torque_limits(model: pin.Model) -> Array:
 
 
 def allocation_matrix(model: pin.Model, propulsion: PropulsionSpec) -> Array:
-    """Map rotor thrusts (N) to the base wrench ``[force; moment]``, in the base frame at its origin.
+    """Return the map from rotor thrusts (N) to the base wrench ``[force; moment]``, shape (6, rotors).
 
-    In the propulsion frame, the wrench per unit thrust of a rotor is ``[d; p × d - s κ d]``, with its position ``p``,
-    unit thrust direction ``d``, spin ``s`` and drag ratio ``κ``.  The result, shape (6, n_rotors), is in the base
-    (root joint) frame.  The model must be free-flying, with the propulsion frame on its base body.
+    In the propulsion frame, the wrench per unit thrust of a rotor is ``[d; p × d - s κ d]``, with position ``p``,
+    unit thrust direction ``d``, spin ``s`` and drag ratio ``κ``.  The result is in the base (root joint) frame about
+    its origin.  The model must be free-flying, with the propulsion frame on the base body.
     """
     if not is_free_flyer(model):
         raise SpecError("rotors on a robot that cannot fly", where="propulsion", hint='set root = "free-flyer"')
@@ -137,7 +136,7 @@ def allocation(model: pin.Model, propulsion: PropulsionSpec) -> Allocation:
 def actuation_matrix(model: pin.Model, propulsion: PropulsionSpec | None = None) -> Array:
     """Return the constant ``G`` of ``M ν̇ + h = G u``, ``u = [thrusts (N); joint torques (N·m)]``.
 
-    The shape is nv × (n_rotors + n_joints), with joints in the order of ``ν``.  Without ``propulsion``, the base of a
+    The shape is (nv, rotors + joints), with joints in the order of ``ν``.  Without ``propulsion``, the base of a
     free-flying robot is not actuated.  A fixed-base robot has ``G = I``.
     """
     base = 6 if is_free_flyer(model) else 0
@@ -152,10 +151,9 @@ def actuation_matrix(model: pin.Model, propulsion: PropulsionSpec | None = None)
 def hover(model: pin.Model, propulsion: PropulsionSpec, q: ArrayLike) -> Hover:
     """Return the thrusts and torques that hold posture ``q`` at rest: ``h(q, 0) = G u``.
 
-    The rows of the base determine the thrusts, which are unique for six independent rotors.  With more rotors, the
-    result is the solution whose thrusts are farthest from their limits.  If the rotors cannot produce the wrench,
-    the result is the nearest solution within the limits.  The other rows are the torques, which must be within the
-    effort limits of the model.
+    The six base rows of the equation determine the thrusts.  With more than six rotors, the thrusts farthest from
+    their limits are chosen.  If the rotors cannot balance the weight, the thrusts within their limits with the
+    smallest residual are chosen.  The joint rows determine the torques, which must be within the effort limits.
     """
     matrix = allocation_matrix(model, propulsion)
     low, high = thrust_limits(propulsion)
@@ -186,9 +184,10 @@ def hover(model: pin.Model, propulsion: PropulsionSpec, q: ArrayLike) -> Hover:
 def lateral_force_range(model: pin.Model, propulsion: PropulsionSpec, q: ArrayLike) -> LateralForce:
     """Return the largest net horizontal force that keeps attitude and height, in each of four directions.
 
-    A linear program for each direction maximizes ``F = m a`` over thrusts ``f`` and acceleration ``a >= 0``.  The
-    vector ``e`` moves the whole robot in the direction.  The six rows ``A f = h_b + M_b e a`` carry the weight and
-    permit no rotation.  Other constraints are the thrust limits and ``|h_j + M_j e a| <= τ_max`` for the joints.
+    For each direction, a linear program maximizes ``F = m a`` over thrusts ``f`` and acceleration ``a >= 0``.  The
+    generalized velocity ``e`` translates the whole robot in this direction.  The constraint ``A f = h_b + M_b e a``
+    (base rows) balances the weight without rotation.  The other constraints are the thrust limits and the torque
+    limits ``|h_j + M_j e a| <= τ_max`` (joint rows).
     """
     matrix = allocation_matrix(model, propulsion)
     low, high = thrust_limits(propulsion)
@@ -223,11 +222,11 @@ def lateral_force_range(model: pin.Model, propulsion: PropulsionSpec, q: ArrayLi
 
 
 def _centred_thrusts(matrix: Array, wrench: Array, low: float, high: float) -> Array:
-    """Return the thrusts with ``A f = w`` farthest from their limits, or else the nearest within the limits."""
+    """Return the thrusts with ``A f = w`` farthest from their limits, or else least-squares thrusts within them."""
     count = matrix.shape[1]
     if count == 6 and np.linalg.matrix_rank(matrix) == 6:
         return np.asarray(np.linalg.solve(matrix, wrench))
-    # Variables f and s: low + s (high - low) <= f <= high - s (high - low) with the largest s.
+    # Maximize s over f and s with low + s (high - low) <= f <= high - s (high - low).
     width = np.full((count, 1), high - low)
     solution = _maximize_last(
         np.column_stack([matrix, np.zeros(6)]),
@@ -247,7 +246,7 @@ def _maximize_last(
     A: Array, b: Array, A_upper: Array, b_upper: Array, bounds: list[tuple[float | None, float | None]]
 ) -> Array | None:
     """Return the ``x`` with the largest last entry subject to ``A x = b``, ``A_upper x ≤ b_upper`` and the bounds."""
-    # Imported here, because SciPy takes long to import and online controllers only need G.
+    # SciPy is slow to import, and online controllers do not need this function.
     from scipy.optimize import linprog
 
     cost = np.r_[np.zeros(A.shape[1] - 1), -1.0]

@@ -18,9 +18,9 @@ ArmatureOption = Mapping[str, float] | str | None
 
 
 def set_armature(model: pin.Model, spec: RobotSpec, srdf: Path | None, option: ArmatureOption, name: str) -> str:
-    """Set ``model.armature``, kg·m² (kg for prismatic joints); return the source of the values in words.
+    """Set ``model.armature``, kg·m² (kg for prismatic joints); return a description of the source of the values.
 
-    The values come from the option, else from robot.toml, else from rotor data of the SRDF, else they are zero.
+    The source is the option, or else robot.toml, or else the rotor data of the SRDF, or else zero.
 
     Raises:
         InputError: A joint does not exist, a value is below zero, or a file cannot be read.
@@ -51,7 +51,7 @@ def set_armature(model: pin.Model, spec: RobotSpec, srdf: Path | None, option: A
 
 
 def armature_warning(model: pin.Model, source: str, held: Sequence[str] = ()) -> tuple[str, ...]:
-    """Return a warning about joints without armature, or nothing; joints that are held by default are ignored."""
+    """Return a warning about joints without armature, if there are any, except the joints ``held``."""
     armature = np.asarray(model.armature)
     counted = {i: str(model.names[i]) for i in joint_range(model) if model.names[i] not in held}
     bare = [name for i, name in counted.items() if not (armature[v_slice(model, i)] > 0).any()]

@@ -22,26 +22,26 @@ from impact_posture.robot.urdf import EXAMPLE_PREFIX, example_robot_data, resolv
 from impact_posture.system.escape import toml
 from impact_posture.system.output_folder import check_name
 
-# Pose modes by the least number of joints before a frame of a fixed robot, so that the posture keeps some freedom.
+# Smallest number of joints that lead to the contact frame, and the guessed contact pose, which leaves some freedom.
 _POSES = ((7, "full"), (6, "aligned"), (4, "position"), (0, "free"))
-# Least depth (m) of the center of mass in the support polygon for com_over_feet.
+# Smallest distance (m) of the center of mass from the edges of the support polygon for com_over_feet.
 _LEAST_DEPTH = 0.02
 
 
 def write_draft(robot: str, options: LoadOptions, out: Path | None, *, force: bool = False) -> tuple[Path, Draft]:
     """Write a commented ``robot.toml`` that can be loaded without changes; return its path and its content.
 
-    ``options`` are data that the user states; other data are read or guessed.  By default, ``out`` is ``robot.toml``
-    beside the URDF, or ``./<name>.toml`` for a URDF in a package.
+    ``options`` are data from the user; other data are read or guessed.  By default, ``out`` is ``robot.toml`` beside
+    the URDF, or ``./<name>.toml`` for a URDF of example-robot-data.
 
     Raises:
-        InputError: The robot is known by name, so that it has a ``robot.toml``.
-        OutputError: The file exists and ``force`` is not set, or it cannot be written.
+        InputError: The robot is a known name, which has a ``robot.toml`` already.
+        OutputError: ``out`` exists and ``force`` is false, or ``out`` cannot be written.
     """
     if robot in known_robots():
         hint = "name a .urdf, or write the differences into a file and give it by `config`"
         raise InputError("has its robot.toml already", where=robot, hint=hint)
-    # The empty file replaces a robot.toml beside the URDF.
+    # The empty file os.devnull is read in place of a robot.toml beside the URDF.
     located = locate(robot, LoadOptions(config=os.devnull))
     in_package = located.source.startswith(EXAMPLE_PREFIX)
     out = out or (Path(f"{located.urdf.stem}.toml") if in_package else located.urdf.parent / "robot.toml")
@@ -49,7 +49,7 @@ def write_draft(robot: str, options: LoadOptions, out: Path | None, *, force: bo
     if out.exists() and not force:
         raise OutputError("exists", where=str(out), hint="name another file, or `force` to replace it")
     draft = draft_spec(located, options, out.absolute().parent)
-    # The temporary file is in the same folder, so that its relative paths are the same.
+    # The temporary file is in the same folder as ``out``, because relative paths in it start from its folder.
     temporary = out.with_name(f".{out.name}-{os.getpid()}")
     try:
         temporary.write_text(draft.text, encoding="utf-8")
@@ -119,7 +119,7 @@ def draft_spec(located: Located, options: LoadOptions, folder: Path) -> Draft:
 
 
 def _load(located: Located, options: LoadOptions, root: Root, srdf: Path | None) -> Robot:
-    """Load the robot without a robot.toml; it warns about impossible inertias."""
+    """Load the robot without a robot.toml; impossible inertias become warnings."""
     plain = LoadOptions(
         package_dir=options.package_dir, armature=options.armature, lock=options.lock, lock_massless=True
     )
@@ -146,7 +146,7 @@ def _model(draft: Draft, robot: Robot, options: LoadOptions, folder: Path) -> No
 
 
 def _contact(draft: Draft, robot: Robot, feet: Sequence[str], ends: Sequence[str]) -> Sequence[str]:
-    """Write the table of the contact; return the joints that move its frame."""
+    """Add the table ``[contact]`` to the draft; return the joints that move the contact frame."""
     base, fingers = guess.base_frame(robot), guess.fingers(robot)
     legs = {joint for foot in feet for joint in guess.joints_to(robot, foot)}
     arms: list[str] = []
@@ -253,7 +253,7 @@ def _armature(draft: Draft, robot: Robot, options: LoadOptions) -> None:
 
 
 def _path(path: Path, folder: Path) -> str:
-    """Return a path for the file: an example-robot-data URI, or relative to ``folder``."""
+    """Return a path as an example-robot-data URI, or relative to ``folder``."""
     path = path.expanduser().resolve()
     if path.is_relative_to(example_robot_data()):
         return EXAMPLE_PREFIX + path.relative_to(example_robot_data()).as_posix()

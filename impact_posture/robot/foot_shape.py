@@ -20,18 +20,18 @@ from impact_posture.robot.support_polygon import polygon_edges
 from impact_posture.robot.urdf import quiet_stderr
 from impact_posture.system.arrays import Array
 
-# Points of a foot within this distance (m) of its lowest point touch the ground, too.
+# Points of a foot up to this height (m) above its lowest point also touch the ground.
 _PATCH = 2e-3
-# A patch narrower than this (m) is a point.
+# A contact area narrower than this (m) is treated as a point.
 _SOLE = 0.01
-# Cosine of the tilt up to which the frame of a sole counts as upright: 1°.
+# Cosine of the largest tilt of an upright sole frame, 1°.
 _UPRIGHT = float(np.cos(np.radians(1.0)))
 
 
 def support(robot: Robot, frame: str, urdf: Path, *, flat: bool) -> Support:
-    """Return a foot with its contact point or sole from its primitive collision shapes.
+    """Return a foot with the contact point or the sole of its boxes, cylinders and balls.
 
-    A foot without such shapes is a surface if it is ``flat``.
+    A foot without such shapes becomes a surface if ``flat``, else a point.
     """
     data, index = upright_frames(robot), robot.frame_id(frame)
     points = _lowest_points(robot, data, index, urdf)
@@ -50,13 +50,13 @@ def support(robot: Robot, frame: str, urdf: Path, *, flat: bool) -> Support:
 
 
 def foot_specs(robot: Robot, feet: Sequence[str], urdf: Path) -> list[Support]:
-    """Return the feet as supports.  Two feet on legs of six joints or more count as flat."""
+    """Return the feet as supports.  Two feet on legs of six or more joints are assumed to be flat."""
     flat = len(feet) == 2
     return [support(robot, f, urdf, flat=flat and len(joints_to(robot, f)) > 5) for f in feet]
 
 
 def support_depth(robot: Robot, feet: Sequence[Support]) -> float:
-    """Return the depth of the center of mass in the support polygon, m; negative outside or without a polygon."""
+    """Return the distance from the center of mass to the support polygon's edges, m; negative if outside."""
     model, q = robot.model, robot.posture()
     data = model.createData()
     pin.framesForwardKinematics(model, data, q)
@@ -71,7 +71,7 @@ def support_depth(robot: Robot, feet: Sequence[Support]) -> float:
 
 
 def _lowest_points(robot: Robot, data: pin.Data, index: int, urdf: Path) -> Array:
-    """Return the lowest points (world) of the primitive collision shapes that move with a frame, without meshes."""
+    """Return world points on the undersides of the boxes, cylinders and balls that move with a frame."""
     joint, root = robot.model.frames[index].parentJoint, ET.parse(urdf).getroot()
     for link in root.iter("link"):
         for collision in link.findall("collision"):
@@ -85,7 +85,7 @@ def _lowest_points(robot: Robot, data: pin.Data, index: int, urdf: Path) -> Arra
 
 
 def _bottom(shape: Any, at: pin.SE3) -> Sequence[Array]:
-    """Return points of a primitive shape, its lowest points among them."""
+    """Return points of a box, cylinder or ball that include the lowest points."""
     match shape:
         case coal.Sphere():
             return [at.translation - [0, 0, shape.radius]]

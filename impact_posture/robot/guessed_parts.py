@@ -1,4 +1,4 @@
-"""Guesses from names and geometry of a robot: feet, tips, fingers, wheels."""
+"""Guess feet, ends of limbs, fingers and wheels of a robot from names and geometry."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from impact_posture.robot.model_joints import joint_range
 from impact_posture.robot.named_postures import states_with_base
 from impact_posture.robot.robot import Robot
 
-# Common names of parts, collected from URDFs such as those of example-robot-data.
+# Common names of robot parts, collected from URDFs.
 _FOOT = re.compile(r"sole|foot|feet|hoof|paw|toe|ankle", re.I)
 _ARM = re.compile(r"(?<!h)arm(?!ature)|shoulder|elbow|wrist|hand|gripper|head|neck", re.I)
 _WHEEL = re.compile(r"wheel|caster|track", re.I)
@@ -29,14 +29,14 @@ _SENSOR = re.compile(
 )
 _FLYING = re.compile(r"fly|copter|drone|uav|aerial|quadrotor|hexarotor|propeller", re.I)
 
-# Parts of the names of start postures, best first.
+# Words in the names of start postures, best first.
 _STARTS = ("stand", "half_sitting", "home", "ready", "default", "homing", "up")
-# Greatest height of feet above the lowest point, as a share of the robot's height.
+# Largest height of a foot above the lowest point of the robot, relative to the robot's height.
 _LEVEL = 0.1
 
 
 def chain(robot: Robot, joint: int) -> list[int]:
-    """Return the joint and its ancestors, without the free-flyer."""
+    """Return the indices of a joint and its ancestors, without the free-flyer."""
     return [int(i) for i in robot.model.supports[joint] if i in joint_range(robot.model)][::-1]
 
 
@@ -56,7 +56,7 @@ def _leaves(robot: Robot) -> list[int]:
 
 
 def upright_frames(robot: Robot) -> pin.Data:
-    """Return the frames at the default posture with the base at the world origin."""
+    """Return the frame placements at the default posture, with the base upright at the world origin."""
     q, data = robot.posture(), robot.model.createData()
     if robot.floating:
         q[:7] = (0, 0, 0, 0, 0, 0, 1)
@@ -65,9 +65,10 @@ def upright_frames(robot: Robot) -> pin.Data:
 
 
 def feet(robot: Robot, named: Sequence[str] = ()) -> tuple[str, ...]:
-    """Return frames that look like feet: ends of legs that reach the lowest level of the default posture.
+    """Return frames that are probably feet.
 
-    Feet that the SRDF names as end effectors (``named``) replace the guess, and feet by name replace feet by height.
+    The first non-empty choice is used: the frames ``named`` by the SRDF, ends of limbs with a name like "foot", or
+    at least two ends of limbs near the lowest height of the default posture.
     """
     known = tuple(name for name in named if name in robot.frame_names)
     if known:
@@ -83,7 +84,7 @@ def feet(robot: Robot, named: Sequence[str] = ()) -> tuple[str, ...]:
         excluded = (_WHEEL, _FINGER) if by_name else (_WHEEL, _FINGER, _ARM)
         if len(line) < 2 or not links or any(part.search(word) for part in excluded for word in words):
             continue
-        # A sole is part of a foot, and an ankle lies above it.
+        # Prefer the sole, or else the lowest link, because an ankle lies above its foot.
         best = min(by_name or links, key=lambda n: ("sole" not in n.lower(), round(height[n], 3), links.index(n)))
         (called_feet if by_name else others).append(best)
     if called_feet:
@@ -117,14 +118,14 @@ def tips(robot: Robot, feet: Sequence[str] = ()) -> tuple[str, ...]:
             return 1, depth
         return (2 if _HAND.search(name) else 3), depth
 
-    # Outer frames of a link come later in the URDF.
+    # Of equally likely frames, prefer the last in the URDF, which is usually farthest out.
     moving = [(i, f) for i, f in enumerate(model.frames) if f.parentJoint > 0 and f.name != "root_joint"]
     ordered = sorted(moving, key=lambda entry: (*rank(entry[1]), -entry[0]))
     return tuple(dict.fromkeys(str(frame.name) for _, frame in ordered))
 
 
 def fingers(robot: Robot) -> tuple[str, ...]:
-    """Return the joints that belong to a gripper or hand, by their own name or the name of an ancestor."""
+    """Return the joints with a name like "finger" or "gripper", and all joints after them."""
     names = robot.model.names
     return tuple(
         joint
@@ -134,23 +135,23 @@ def fingers(robot: Robot) -> tuple[str, ...]:
 
 
 def base_frame(robot: Robot) -> str:
-    """Return the frame of the root link."""
+    """Return the name of the root link."""
     joint = 1 if robot.floating else 0
     return str(next(f.name for f in robot.model.frames if f.parentJoint == joint and f.type == pin.FrameType.BODY))
 
 
 def wheels(robot: Robot) -> tuple[str, ...]:
-    """Return the joints that are wheels or casters by their names."""
+    """Return the joints with a name like "wheel" or "caster"."""
     return tuple(name for name in robot.joint_names if _WHEEL.search(name))
 
 
 def flies(robot: Robot) -> bool:
-    """Tell whether a name indicates that the robot flies."""
+    """Return whether the name of the robot or a frame suggests that the robot flies."""
     return any(_FLYING.search(name) for name in (robot.name, *robot.frame_names))
 
 
 def srdf_near(urdf: Path) -> Path | None:
-    """Return the SRDF beside the URDF or in ``../srdf`` whose name begins the URDF's name, or the only SRDF there."""
+    """Return the SRDF beside the URDF or in ``../srdf``: the file with the most similar name, or the only file."""
     folders = (urdf.parent, urdf.parent.parent / "srdf")
     near = [path for folder in folders for path in sorted(folder.glob("*.srdf"))]
     fitting = [path for path in near if urdf.stem.startswith(path.stem)]
@@ -160,13 +161,13 @@ def srdf_near(urdf: Path) -> Path | None:
 
 
 def srdf_end_effectors(srdf: Path | None) -> Mapping[str, str]:
-    """Return the links that the SRDF names as end effectors, each with all its attributes."""
+    """Return the attribute values, as text, of each end-effector link in the SRDF."""
     tags = ET.parse(srdf).getroot().iter("end_effector") if srdf is not None else ()
     return {tag.get("parent_link", ""): " ".join(tag.attrib.values()).lower() for tag in tags}
 
 
 def likely_root(robot: Robot, feet: Sequence[str], srdf: Path | None) -> tuple[Root, str]:
-    """Return the likely root joint and the reason."""
+    """Return the likely root joint, and the reason for this guess."""
     if states := states_with_base(srdf):
         return "free-flyer", f"the SRDF's posture {states[0]} has a base pose"
     if feet:
@@ -177,7 +178,7 @@ def likely_root(robot: Robot, feet: Sequence[str], srdf: Path | None) -> tuple[R
 
 
 def likely_kind(robot: Robot, feet: Sequence[str]) -> tuple[str, str]:
-    """Return the likely kind of the robot and the reason."""
+    """Return the likely robot type, such as ``humanoid``, and the reason for this guess."""
     if len(feet) in (2, 4):
         return ("quadruped", "four feet") if len(feet) == 4 else ("humanoid", "two feet")
     if robot.floating:
@@ -186,7 +187,7 @@ def likely_kind(robot: Robot, feet: Sequence[str]) -> tuple[str, str]:
 
 
 def start_posture(robot: Robot) -> str:
-    """Return a named posture within the limits, preferably for standing or starting."""
+    """Return the name of a posture within the limits, preferably for standing or starting."""
     allowed = []
     for name in robot.postures:
         with suppress(PostureError):

@@ -12,11 +12,11 @@ from impact_posture.errors import InertiaError
 from impact_posture.robot.model_joints import v_slice
 from impact_posture.robot.robot import Robot
 
-# A mass (kg) or a moment (kg m²) below _TINY is treated as zero.  A relative fault below the slack is treated as a
-# rounding error.
+# Masses (kg) and moments of inertia (kg m²) below this are treated as zero.
 _TINY = 1e-10
 # Products of larger entries of a mass matrix overflow.
 _LARGEST = 1e100
+# Relative violation of the triangle inequality that is treated as a rounding error.
 _TRIANGLE_SLACK = 1e-3
 # Ratio of extreme eigenvalues below which a mass matrix with unit diagonal is singular; known robots exceed 1e-3.
 _SINGULAR = 1e-12
@@ -25,7 +25,7 @@ _SINGULAR = 1e-12
 def check_inertias(root: ET.Element, model: pin.Model, path: Path, accept: bool) -> tuple[str, ...]:
     """Raise an error for links with impossible masses or inertias; return warnings.
 
-    A fault is a warning with ``accept``, or if it is too small to matter in the body that contains the link.
+    An error becomes a warning if ``accept``, or if it is negligible in the inertia of the body of the link.
 
     Raises:
         InertiaError: A mass is negative, a link without mass has moments, or moments break the triangle inequality.
@@ -66,7 +66,7 @@ def massless_joints(model: pin.Model) -> tuple[str, ...]:
 
 
 def check_moved_mass(model: pin.Model, where: str) -> None:
-    """Raise ``InertiaError`` if joints move no mass, and name them, because the mass matrix would be singular."""
+    """Raise ``InertiaError`` if joints move no mass, because the mass matrix would be singular."""
     if not (joints := massless_joints(model)):
         return
     named = ", ".join(f"'{name}'" for name in joints)
@@ -80,7 +80,7 @@ def check_moved_mass(model: pin.Model, where: str) -> None:
 
 
 def check_mass_matrix(robot: Robot, where: str) -> None:
-    """Refuse a robot whose mass matrix is singular at the default posture.
+    """Raise an error if the mass matrix is singular at the default posture.
 
     Possible causes are a massless floating base, a rotating point mass, or two joints about the same axis.  ``M`` is
     first scaled to a unit diagonal, so that kg and kg m² can be compared.
@@ -103,7 +103,7 @@ def check_mass_matrix(robot: Robot, where: str) -> None:
         values, vectors = np.linalg.eigh(M * np.outer(scale, scale))
         if values[0] >= _SINGULAR * values[-1]:
             return
-        # The free motion in rad and m (per s).
+        # Eigenvector in joint velocities: the motion that meets no inertia.
         motion = np.abs(scale * vectors[:, 0])
         free = motion >= 0.1 * motion.max()
     names = [name for name, moves in zip(robot.tangent_names, moving, strict=True) if moves]
@@ -115,7 +115,7 @@ def check_mass_matrix(robot: Robot, where: str) -> None:
 
 
 def _link_fault(link: ET.Element, where: str) -> tuple[float, str] | None:
-    """Return the distance of the inertia of a link from a possible inertia, kg m², and the fault in words."""
+    """Return the size (kg m²) and a description of the error in the inertia of a link, if there is any."""
     inertial, name = link.find("inertial"), link.get("name", "?")
     if inertial is None:
         return None

@@ -1,9 +1,9 @@
 """Joint models: the inertia at the joints in an impact, with rotors, without rotors, or with locked joints.
 
-A short impact ends before a soft spring between rotor and link has turned the rotor.  In that case, only the link
-reacts (``M``).  With a stiff transmission, the rotor moves with the link (``M + B``, with the armature ``B``).  A
-joint that cannot be driven from its link does not move at all.  Each joint model sets the armature to the rotor
-inertia, zero, or infinity.
+With a soft spring between rotor and link, a short impact ends before the rotor turns.  The inertia is then ``M``, the
+mass matrix of the links.  With a stiff transmission, the rotor moves with the link, and the inertia is ``M + B``,
+where ``B`` is the armature.  A joint that cannot be driven from its link does not move.  These cases are modeled by
+an armature of zero, of the rotor inertia, and of infinity.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ Mask = NDArray[np.bool_]
 class Transmissions:
     """Transmission of each velocity entry, shape (nv,); a floating base has none.
 
-    The rotor of a ``rigid`` joint moves with the link.  A ``locked`` joint cannot be driven from its link.  The
-    ``stiffness`` between rotor and link, N·m/rad (N/m if prismatic), is infinite where the robot states none.
-    ``damping`` acts in parallel with this spring, N·m·s/rad (N·s/m).
+    The rotor of a ``rigid`` joint moves with the link.  A ``locked`` joint cannot be driven from its link.
+    ``stiffness`` between rotor and link is in N·m/rad (N/m if prismatic), and infinite if robot.toml does not state
+    it.  ``damping`` acts in parallel with this spring, N·m·s/rad (N·s/m).
     """
 
     rigid: Mask
@@ -46,7 +46,7 @@ class Transmissions:
 
 
 def transmissions(robot: Robot) -> Transmissions:
-    """Return the ``[transmission]`` of robot.toml by velocity entry; an unknown joint raises ``JointNotFound``."""
+    """Return the transmissions in robot.toml; raise ``JointNotFound`` if robot.toml names an unknown joint."""
     spec, model, nv = robot.spec.transmission, robot.model, robot.nv
     result = Transmissions(np.zeros(nv, dtype=bool), np.zeros(nv, dtype=bool), np.full(nv, np.inf), np.zeros(nv))
     for joint in spec.joints:
@@ -62,20 +62,20 @@ def transmissions(robot: Robot) -> Transmissions:
 
 
 def with_joint_model(robot: Robot, joint_model: JointModel) -> Robot:
-    """Return the robot with the armature that an impact meets.
+    """Return the robot with the armature of a joint model.
 
     - ``reflected`` keeps the armature at all joints.
-    - ``link`` removes it, except at joints with a ``rigid`` transmission.
+    - ``link`` removes the armature, except at joints with a ``rigid`` transmission.
     - ``locked`` locks all joints, as position control with stiff gears does, so that only a floating base moves.
-    - ``elastic`` removes it at joints with springs of known stiffness, whose rotors follow later
-      (:mod:`impact_posture.impact.elasticity.elastic_impact`).  H, G, V, S and E describe the first instant of the
-      impact.
+    - ``elastic`` removes the armature at joints with springs of known stiffness.  H, G, V, S and E then describe the
+      first instant of the impact.  The rotors follow later
+      (:mod:`impact_posture.impact.elasticity.elastic_impact`).
 
     A joint with a ``locked`` transmission moves in no joint model.
 
     Raises:
         InertiaError: The mass matrix is singular without the rotors.
-        InputError: No joint and no base can move, or ``elastic`` finds no spring.
+        InputError: Nothing can move, or ``elastic`` is chosen for a robot without springs.
     """
     stated, table = robot.armature, transmissions(robot)
     armature = stated.copy()
@@ -85,7 +85,7 @@ def with_joint_model(robot: Robot, joint_model: JointModel) -> Robot:
     elif joint_model == "locked":
         armature[joints] = np.inf
     elif joint_model == "elastic":
-        # A rotor without inertia offers no resistance to its spring.
+        # A rotor without inertia moves with its spring, so the spring has no effect.
         springs = table.elastic & (stated > 0)
         if not springs.any():
             fault = f"no joint of {robot.name} has a rotor on a spring of known stiffness"
@@ -106,7 +106,7 @@ def with_joint_model(robot: Robot, joint_model: JointModel) -> Robot:
 
 
 def describe_joints(robot: Robot) -> str:
-    """Describe in words which inertia an impact meets at the joints."""
+    """Describe the joint model of a robot, for messages."""
     armature = np.asarray(robot.model.armature)[6 if robot.floating else 0 :]
     held, kept = int(np.isinf(armature).sum()), int((np.isfinite(armature) & (armature > 0)).sum())
     words = {

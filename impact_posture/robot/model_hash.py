@@ -11,12 +11,12 @@ import pinocchio as pin
 
 from impact_posture.system.arrays import Array
 
-# Rounding error of a zero in a rotation matrix or an inertia (SI units).
+# Smaller numbers in rotation matrices and inertias (SI units) are rounding errors of zero.
 _ROUNDING = 1e-14
 
 
 def dynamics_hash(model: pin.Model, armature: Array) -> str:
-    """Return the hash of joints, placements, inertias and an armature, shape (nv,)."""
+    """Return the hash of joints, placements, inertias and ``armature``, shape (nv,)."""
     joints = []
     for i in range(1, model.njoints):
         arrays = model.jointPlacements[i].homogeneous, model.inertias[i].matrix(), _axis(model.joints[i])
@@ -36,20 +36,20 @@ def kinematics_hash(model: pin.Model, postures: Mapping[str, Array], default: st
 
 
 def hash_of(content: object) -> str:
-    """Return the SHA-256 of content that JSON can hold."""
+    """Return the SHA-256 of a value as JSON."""
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()
 
 
 def rounded(values: object) -> list[str]:
-    """Return numbers to 12 digits as text, with zero for rounding errors."""
+    """Return numbers as text with 12 digits; numbers up to 1e-14 become zero."""
     return [f"{v:.12g}" if abs(v) > _ROUNDING else "0" for v in map(float, np.asarray(values).reshape(-1))]
 
 
 def _axis(joint: pin.JointModel) -> Array:
-    """Return the motion subspace of a joint at the identity, which distinguishes two unaligned joints."""
+    """Return the motion subspace of a joint at the neutral configuration; unlike the type, it shows the axis."""
     model = pin.Model()
     model.addJoint(0, joint, pin.SE3.Identity(), "joint")
-    # A copy in a model of its own, because the joint would read other entries of a configuration.
+    # Use a model with this joint alone, because the joint reads its entries of the configuration by index.
     copy = model.joints[1]
     data = copy.createData()
     copy.calc(data, pin.neutral(model))

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from impact_posture.errors import JointNotFound
 
-# Pinocchio writes "no limit" as the largest double.
+# Limits beyond this are no limits.  Pinocchio writes "no limit" as the largest double.
 ENDLESS = 1e10
 
 
 def is_free_flyer(model: pin.Model) -> bool:
-    """Tell whether the first joint of a model is a free-flyer."""
+    """Return whether the first joint of a model is a free-flyer."""
     return bool(model.njoints > 1 and model.joints[1].shortname() == "JointModelFreeFlyer")
 
 
@@ -40,7 +40,7 @@ def scalar_entries(model: pin.Model, index: int, value: float) -> tuple[float, .
 
 
 def joint_index(model: pin.Model, joint: str, where: str) -> int:
-    """Return the index of a movable joint; for another name raise ``JointNotFound`` with the nearest names."""
+    """Return the index of a movable joint; raise ``JointNotFound`` for any other name."""
     known = movable_joints(model)
     if joint not in known:
         raise JointNotFound(joint, known, where=where)
@@ -53,7 +53,7 @@ def movable_joints(model: pin.Model) -> list[str]:
 
 
 def finite_armature(model: pin.Model) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return the armature with zeros at locked joints, and which velocity entries are locked, shapes (nv,).
+    """Return the armature with zeros at locked joints, and whether each velocity entry is locked, shape (nv,) each.
 
     An infinite armature locks a joint in an impact: its velocity does not change, whatever the impulse.
     """

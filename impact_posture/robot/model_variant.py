@@ -1,4 +1,4 @@
-"""Variants of a robot under other assumptions: more or less armature, a payload."""
+"""Variants of a robot model: with more or less armature, or with a payload."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from impact_posture.robot.joint_model import with_joint_model
 from impact_posture.robot.robot import Robot
 
 AS_MODELED = "as modeled"
-# Largest number of variants, because each is a separate model in the optimization.
+# Largest number of variants, because the optimization contains a separate model for every variant.
 MOST_VARIANTS = 12
 
 
@@ -30,7 +30,7 @@ class Payload:
 
 @dataclass(frozen=True, eq=False)
 class ModelVariant:
-    """A possible model of the robot, with a factor on the stated armature and a payload or ``None``."""
+    """A possible model of the robot, with a factor on the armature in robot.toml, and possibly a payload."""
 
     name: str
     robot: Robot
@@ -51,10 +51,10 @@ class ModelVariant:
 def build_model_variants(
     robot: Robot, armature_range: Factors | None, payloads: Sequence[Payload]
 ) -> tuple[ModelVariant, ...]:
-    """Return all pairs of an armature (as stated, lowest, highest) and a payload (none, or one of ``payloads``).
+    """Return the combinations of the factors 1, lowest and highest on the armature with no payload and each payload.
 
-    ``armature_range`` has the lowest and the highest factor on the stated armature.  The first variant is the robot
-    as modeled.  The result is empty if nothing is uncertain.
+    ``armature_range`` contains the lowest and the highest factor.  The first variant is the unchanged robot.  The
+    result is empty without a range and payloads.
 
     Raises:
         InputError: A range or mass is invalid, the armature is zero, or there are too many variants.
@@ -106,16 +106,16 @@ def _variant(robot: Robot, factor: float, payload: Payload | None) -> ModelVaria
 
 
 def between(variants: Sequence[ModelVariant], count: int, seed: int) -> list[Robot]:
-    """Return random robots between the variants of :func:`build_model_variants`.
+    """Return ``count`` random robots between the variants of :func:`build_model_variants`.
 
-    Each robot has a random factor on the armature and a random share of one of the payloads.
+    Each robot has a random factor on the armature, and one of the payloads with a random fraction of its mass.
     """
     generator = np.random.default_rng(seed)
     factors = [variant.armature_factor for variant in variants]
     payloads = [variant.payload for variant in variants if variant.payload is not None]
     robots = []
     for _ in range(count):
-        # Uniform in the logarithm, because the factors 1/2 and 2 are equally far from 1.
+        # Draw uniformly in the logarithm, in which the factors 1/2 and 2 are equally far from 1.
         factor = float(np.exp(generator.uniform(np.log(min(factors)), np.log(max(factors)))))
         payload = None
         if payloads:

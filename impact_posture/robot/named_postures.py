@@ -1,4 +1,4 @@
-"""Named postures of a model, from its SRDF and ``robot.toml``, and the neutral posture."""
+"""Named postures of a model: from its SRDF, from ``robot.toml``, and the neutral posture."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def named_postures(
     """
     postures = _srdf_postures(model, srdf, spec) | _toml_postures(model, spec, root, name)
     default = spec.default_posture or next(iter(postures), "neutral")
-    # A joint whose limits exclude zero is at the nearest limit.
+    # If the limits of a joint exclude zero, the joint is at the limit nearest to zero.
     postures.setdefault("neutral", np.clip(pin.neutral(model), model.lowerPositionLimit, model.upperPositionLimit))
     if default not in postures:
         fault = f"default_posture '{default}' does not exist"
@@ -48,7 +48,7 @@ def states_with_base(srdf: Path | None) -> list[str]:
 
 
 def ignored_bases(spec: RobotSpec, srdf: Path | None, default: str) -> tuple[str, ...]:
-    """Return a warning about postures whose base pose is ignored because the root is fixed, or nothing."""
+    """Return a warning if postures of a robot with a fixed root have base poses, which are ignored."""
     named = [key for key, posture in spec.postures.items() if posture.base is not None] + states_with_base(srdf)
     if not named:
         return ()
@@ -64,7 +64,7 @@ def _srdf_postures(model: pin.Model, srdf: Path | None, spec: RobotSpec) -> dict
         return {}
     try:
         pin.loadReferenceConfigurations(model, str(srdf), False)
-    except Exception as error:  # Pinocchio passes on whatever its XML library raises.
+    except Exception as error:  # The XML library of Pinocchio may raise any exception.
         raise UrdfError(f"is not an SRDF ({error})", where=str(srdf), hint="correct the SRDF") from None
     states = {item.key(): np.array(item.data(), dtype=float) for item in model.referenceConfigurations}
     return {name: pin.normalize(model, q) for name, q in states.items() if name not in spec.postures}
@@ -78,7 +78,7 @@ def _toml_postures(model: pin.Model, spec: RobotSpec, root: Root, name: str) -> 
         if posture.base is not None and spec.model.root != "free-flyer" and root != "free-flyer":
             fault = f"posture '{key}' gives a base pose, but the root is fixed"
             raise SpecError(fault, where=name, hint='remove it, or write root = "free-flyer" in [model]')
-        # A floating robot that the user fixes to the world keeps its postures (ignored_bases warns about their base).
+        # If the user fixes a floating robot to the world, base poses are ignored, and ignored_bases warns.
         if posture.base is not None and root == "free-flyer":
             norm = float(np.linalg.norm(posture.base[3:]))
             if not (np.isfinite(posture.base).all() and abs(norm - 1) < 1e-3):

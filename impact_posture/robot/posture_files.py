@@ -30,20 +30,20 @@ _NO_BASE = "remove the base and give `normal` in those axes, or use `root` free-
 
 
 def read_posture(robot: Robot, text: str | None, where: str = "posture") -> Array:
-    """Return the posture that ``text`` names, shape (nq,), after checks of its length, quaternion and limits.
+    """Return the posture that ``text`` names, shape (nq,); check its length, quaternion and limits.
 
     Args:
         robot: The robot.
-        text: Name of one of its postures, or a file: ``posture.json`` (``q`` in the order of ``joint_names``),
+        text: Name of a posture of the robot, or a file: ``posture.json`` (``q`` in the order of ``joint_names``),
             ``{"base": [x, y, z, qx, qy, qz, qw], "joints": {name: value}}``, or a ``sensor_msgs/JointState`` in YAML
-            (``name: [...]``, ``position: [...]``).  By name, a continuous joint is one angle in rad, and other joints
-            stay as in the default posture.  ``None`` means the default posture.
-        where: Option or file to name in errors.
+            (``name: [...]``, ``position: [...]``).  A continuous joint is given as an angle, rad.  Joints that the
+            file does not name stay as in the default posture.  ``None`` means the default posture.
+        where: Option or file, for error messages.
 
     Raises:
-        PostureNotFound: ``text`` is neither a posture nor a file; carries the nearest names.
-        JointNotFound: A file names a joint that the robot lacks; carries the nearest names.
-        PostureError: The file cannot be read, or its numbers cannot be a posture of this robot.
+        PostureNotFound: ``text`` is neither a posture nor a file.
+        JointNotFound: The file names a joint that the robot does not have.
+        PostureError: The file cannot be read, or is not a posture of this robot.
     """
     if text is None or text in robot.postures:
         return robot.check_posture(robot.posture(text), where=f"{where} {text or robot.default_posture}")
@@ -55,10 +55,7 @@ def read_posture(robot: Robot, text: str | None, where: str = "posture") -> Arra
 
 
 def write_posture(robot: Robot, q: Array) -> dict[str, object]:
-    """Return the content of ``posture.json`` for ``q``, shape (nq,); :func:`read_posture` reads it back.
-
-    Raise ``PostureError`` if ``q`` cannot be a posture of this robot.
-    """
+    """Return the content of ``posture.json`` for ``q``, shape (nq,); raise ``PostureError`` if ``q`` is not valid."""
     q = robot.check_posture(q, limits=False)
     return {
         "schema": SCHEMA,
@@ -70,20 +67,19 @@ def write_posture(robot: Robot, q: Array) -> dict[str, object]:
 
 
 def posture_path(text: str) -> Path | None:
-    """Return the path if ``text`` names a posture file, else ``None``."""
+    """Return the path of a posture file, or ``None`` if ``text`` cannot be one."""
     path = Path(text).expanduser()
     return path if path.suffix in (".json", ".yaml", ".yml") or os.path.isfile(path) else None
 
 
 def _load(path: Path) -> Mapping[str, object]:
-    # Imported here, because few postures come from files.
-    import yaml
+    import yaml  # Imported here, because few postures come from files.
 
     kind = "JSON" if path.suffix == ".json" else "YAML"
     try:
         text = read_text(path)
-        # `ros2 topic echo` ends each message with `---`, so only the first document is read.  The base loader keeps
-        # scalars as text.  Other loaders read 1:30 as 90 and a joint called `on` as true, and fail on bad tags.
+        # `ros2 topic echo` ends each message with `---`, so only the first document is read.  BaseLoader keeps
+        # scalars as text.  Other loaders read 1:30 as 90 and a joint name `on` as true, and fail on unknown tags.
         data = json.loads(text) if kind == "JSON" else next(yaml.load_all(text, yaml.BaseLoader), None)
     except FileNotFoundError:
         raise PostureError("no such file", where=str(path), hint="check the path") from None
@@ -97,7 +93,7 @@ def _load(path: Path) -> Mapping[str, object]:
 
 
 def _configuration(robot: Robot, data: Mapping[str, object], where: str) -> Array:
-    """Read one of the three file formats, which differ in their keys."""
+    """Return the configuration in the content of a posture file.  The keys decide between the three formats."""
     schema = data.get("schema", SCHEMA)
     if schema != SCHEMA:
         fault = f"schema '{shown(schema)}' is not a posture"
@@ -159,13 +155,13 @@ def _by_name(robot: Robot, joints: Mapping[str, object], base: object, where: st
 
 
 def set_joints(robot: Robot, q: Array, joints: Mapping[str, object], where: str) -> Array:
-    """Return a copy of a posture, shape (nq,), with some joints at other values, without a check of the result.
+    """Return a copy of the posture ``q``, shape (nq,), with new values of the named ``joints``.
 
-    Values are by name: a number for a joint of one degree of freedom, the entries of ``q`` for other joints.  Errors
-    name ``where``, an option or file.
+    A value is a number for a joint of one degree of freedom, and the list of its entries of ``q`` for other joints.
+    The result is not checked.  Errors name ``where``, an option or file.
 
     Raises:
-        JointNotFound: The robot lacks a joint; carries the nearest names.
+        JointNotFound: The robot does not have a joint.
         PostureError: A value is invalid.
     """
     q = q.copy()
@@ -178,7 +174,7 @@ def set_joints(robot: Robot, q: Array, joints: Mapping[str, object], where: str)
         entries = q_slice(robot.model, index)
         if robot.model.nvs[index] == 1:
             angle = _number(value, f"joint '{name}'", where)
-            # Cosine and sine of a continuous joint would hide a value that is not finite.
+            # A NaN in the cosine and sine of a continuous joint would be reported without the name of the joint.
             if not math.isfinite(angle):
                 raise PostureError(f"joint '{name}' is not finite", where=where, hint="correct it")
             q[entries] = scalar_entries(robot.model, index, angle)
@@ -207,7 +203,7 @@ def _numbers(value: object, key: str, where: str) -> list[float]:
 
 
 def _number(value: object, key: str, where: str) -> float:
-    # Numbers from YAML are text, with a dot before inf and nan.
+    # Numbers from YAML are text, and YAML writes .inf and .nan.
     if isinstance(value, (int, float, str)) and not isinstance(value, bool):
         with suppress(ValueError, OverflowError):
             return float(re.sub(r"\.(?=(inf|nan)$)", "", value, flags=re.I) if isinstance(value, str) else value)

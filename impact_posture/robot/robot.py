@@ -1,4 +1,4 @@
-"""Robot: a ``pin.Model`` with names, postures, and the data of ``robot.toml``."""
+"""Class Robot: a ``pin.Model`` with names, postures, and the data of ``robot.toml``."""
 
 from __future__ import annotations
 
@@ -47,12 +47,12 @@ class Robot:
         default_posture: Name of the posture to start from.
         spec: The resolved ``robot.toml``.
         locked: Names of the locked joints.
-        armature_source: Source of the armature in words.
+        armature_source: Description of the source of the armature.
         warnings: Warnings about this model, one line each.
-        joint_model: Inertia that the impact meets at the joints
-            (:func:`~impact_posture.robot.joint_model.with_joint_model`).
-        stated_armature: Armature as stated, shape (nv,), if ``joint_model`` has changed ``model.armature``.
-        settings: Settings of :func:`~impact_posture.robot.robot_loader.load_robot`; ``None`` for another origin.
+        joint_model: Model of the inertia at the joints (:func:`~impact_posture.robot.joint_model.with_joint_model`).
+        stated_armature: Original armature, shape (nv,), if ``joint_model`` has changed ``model.armature``.
+        settings: Settings of :func:`~impact_posture.robot.robot_loader.load_robot`; ``None`` if another function made
+            the robot.
     """
 
     name: str
@@ -84,7 +84,7 @@ class Robot:
 
     @property
     def floating(self) -> bool:
-        """Whether the robot's base is free to move."""
+        """Whether the robot has a floating base."""
         return self.root == "free-flyer"
 
     @property
@@ -108,12 +108,12 @@ class Robot:
 
     @cached_property
     def armature(self) -> Array:
-        """Armature of each velocity entry as stated, shape (nv,), kg·m² (kg for prismatic joints)."""
+        """Armature before changes by the joint model, shape (nv,), kg·m² (kg for prismatic joints)."""
         return np.array(self.model.armature if self.stated_armature is None else self.stated_armature, dtype=float)
 
     @property
     def velocity_limits(self) -> Array:
-        """Velocity limits, rad/s or m/s, shape (nv,); infinite where the model states none."""
+        """Velocity limits, rad/s or m/s, shape (nv,); infinite for entries without a limit."""
         limits = np.array(self.model.velocityLimit)
         limits[: 6 if self.floating else 0] = np.inf
         return np.where((limits > 0) & (limits < 1e10), limits, np.inf)
@@ -125,17 +125,17 @@ class Robot:
 
     @cached_property
     def frame_names(self) -> tuple[str, ...]:
-        """Names of all frames at which a contact can be."""
+        """Names of all frames, except the universe."""
         return tuple(f.name for f in self.model.frames if f.name != "universe")
 
     @cached_property
     def model_sha256(self) -> str:
-        """Hash of the data of the dynamics: joints, placements, inertias and armature as stated."""
+        """Hash of the data of the dynamics: joints, placements, inertias and :attr:`armature`."""
         return dynamics_hash(self.model, self.armature)
 
     @cached_property
     def impact_sha256(self) -> str:
-        """Hash like :attr:`model_sha256`, but with the armature of the joint model."""
+        """Hash like :attr:`model_sha256`, but with ``model.armature``, which depends on the joint model."""
         return dynamics_hash(self.model, np.asarray(self.model.armature))
 
     @cached_property
@@ -145,16 +145,16 @@ class Robot:
 
     @cached_property
     def data_sha256(self) -> str:
-        """Hash of all data but shapes: dynamics, kinematics, limits, and ``robot.toml``."""
+        """Hash of all data except shapes: dynamics, kinematics, limits, and ``robot.toml``."""
         efforts, rates = rounded(self.model.effortLimit), rounded(self.model.velocityLimit)
         return hash_of((self.model_sha256, self.kinematics_sha256, efforts, rates, repr(self.spec)))
 
     @checked
     def frame_id(self, name: str) -> int:
-        """Return the index of the frame ``name``, of the link if a link and a joint have this name.
+        """Return the index of a frame.  If a link and a joint have the same name, return the link.
 
         Raises:
-            FrameNotFound: There is no such frame; carries the nearest names.
+            FrameNotFound: There is no such frame.
         """
         if name not in self._frames:
             raise FrameNotFound(name, self.frame_names, where=self.name)
@@ -165,7 +165,7 @@ class Robot:
         frames = list(enumerate(self.model.frames))
         links = [(i, frame.name) for i, frame in frames if frame.type == pin.FrameType.BODY]
         others = [(i, frame.name) for i, frame in frames if frame.name != "universe"]
-        # If several frames have one name, the first link is used, or else the first frame.
+        # Of several frames with the same name, the first link is used, or else the first frame.
         return {name: i for i, name in reversed([*links, *others])}
 
     @checked
@@ -173,8 +173,8 @@ class Robot:
         """Return the index of the joint ``name`` in the model.
 
         Raises:
-            JointNotFound: There is no such joint; carries the nearest names.
-            JointLocked: The joint is rigid.
+            JointNotFound: There is no such joint.
+            JointLocked: The joint is locked.
         """
         if name in self.locked:
             raise JointLocked(name, where=self.name)
@@ -184,7 +184,7 @@ class Robot:
 
     @checked
     def contact_pose(self, frame: str) -> ContactPose:
-        """Return the default pose mode of a contact frame; ``position`` for a point foot."""
+        """Return the default setting ``contact_pose`` for a contact frame."""
         points = [foot.frame for foot in self.spec.supports if foot.kind == "point"]
         return self.spec.contact.frames.get(frame, "position" if frame in points else self.spec.contact.pose)
 
@@ -193,7 +193,7 @@ class Robot:
         """Return a copy of the named posture, or of the default posture, shape (nq,).
 
         Raises:
-            PostureNotFound: There is no such posture; carries the nearest names.
+            PostureNotFound: There is no such posture.
         """
         name = name or self.default_posture
         if name not in self.postures:
@@ -202,12 +202,12 @@ class Robot:
 
     @property
     def upright(self) -> Array | None:
-        """Vertical of the default posture in the axes of a floating base, shape (3,), or ``None``."""
+        """World z axis at the default posture in base axes, shape (3,); ``None`` for a fixed base."""
         return pin.Quaternion(self.posture()[3:7]).matrix()[2].copy() if self.floating else None
 
     @checked
     def check_posture(self, q: Array, *, where: str = "posture", limits: bool = True) -> Array:
-        """Check length, finiteness, quaternion and limits of ``q``; return it with unit quaternions.
+        """Check length, finiteness, quaternion and limits of ``q``; return ``q`` with unit quaternions.
 
         Raises:
             PostureError: ``q`` has a wrong length, a number that is not finite, or an invalid quaternion.
@@ -229,7 +229,7 @@ class Robot:
         return np.asarray(q)
 
     def _check_norms(self, q: Array, where: str) -> None:
-        """Refuse quaternions, and cosines and sines of continuous joints, without unit length."""
+        """Raise an error if a quaternion, or a cosine and sine of a continuous joint, does not have unit length."""
         for i, part in unit_parts(self.model):
             norm = float(np.linalg.norm(q[part]))
             if abs(norm - 1) > 1e-3:
@@ -240,10 +240,10 @@ class Robot:
                 raise PostureError(f"{what} has norm {norm:.4g}", where=where, hint=f"give a unit {kind}{order}")
 
     def _check_swapped(self, quaternion: Array, where: str) -> None:
-        """Raise an error for a base quaternion that is clearly in the order w x y z."""
+        """Raise an error if the base quaternion is clearly in the order w x y z."""
         rotation = pin.Quaternion(*[float(quaternion[k]) for k in (3, 0, 1, 2)]).matrix()
         swapped = pin.Quaternion(*[float(v) for v in quaternion]).matrix()
-        # Upside down in the order x y z w, but upright in the order w x y z.  These robots do not start upside down.
+        # The base is upside down in the order x y z w, but upright in the order w x y z.
         if rotation[2, 2] < -0.9 and swapped[2, 2] > 0.9 and self.spec.kind in ("aerial", "quadruped", "humanoid"):
             fault = "puts the robot on its head"
         elif abs(quaternion[0]) > 0.999 and abs(quaternion[3]) < 0.04:
@@ -268,7 +268,7 @@ class Robot:
 
 
 def unit_parts(model: pin.Model) -> list[tuple[int, slice]]:
-    """Return joints with a quaternion or a cosine and sine, and the entries of these in ``q``."""
+    """Return (joint index, entries in ``q``) of every quaternion and every pair of cosine and sine in ``q``."""
     parts = []
     for joint in range(1, model.njoints):
         freedom, end = int(model.nvs[joint]), q_slice(model, joint).stop

@@ -1,4 +1,4 @@
-"""``robot.toml``: checked data of a robot that URDF and SRDF cannot hold."""
+"""Content of ``robot.toml``: data of a robot that URDF and SRDF cannot contain."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ class ModelSpec(_Table):
     package_dirs: tuple[str, ...] = ()
     lock: tuple[str, ...] = ()
     lock_massless: bool = False
-    # A user may accept the impossible inertias of a published URDF.
+    # Whether impossible inertias, which some published URDFs contain, are warnings instead of errors.
     accept_inertias: bool = False
 
 
 @dataclass(frozen=True)
 class PostureSpec(_Table):
-    """A named posture: base pose ``[x, y, z, qx, qy, qz, qw]`` and joints by name; other joints are neutral."""
+    """A named posture: base pose ``[x, y, z, qx, qy, qz, qw]`` and joints by name; all other joints are neutral."""
 
     base: tuple[float, float, float, float, float, float, float] | None = None
     joints: dict[str, float] = field(default_factory=dict)
@@ -43,7 +43,7 @@ class PostureSpec(_Table):
 
 @dataclass(frozen=True)
 class ContactSpec(_Table):
-    """The default contact frame, and the pose modes of contact frames."""
+    """The default contact frame, and the default setting ``contact_pose`` of contact frames."""
 
     frame: str | None = None
     offset: Vector3 = (0.0, 0.0, 0.0)
@@ -54,11 +54,12 @@ class ContactSpec(_Table):
 @checked
 @dataclass(frozen=True)
 class Support(_Table):
-    """A foot that stays on the ground; its velocities are zero up to the compliance.
+    """A foot that stays on the ground during an impact.
 
     Attributes:
-        kind: ``point`` keeps the velocity of the contact point at zero, ``surface`` also the angular velocity.
-        offset: Contact point from the frame's origin, in the frame, meters.
+        kind: ``point`` keeps the velocity of the contact point at zero; ``surface`` also the angular
+            velocity.
+        offset: Contact point relative to the origin of the frame, in the frame, meters.
         size: Half extents (x, y) of the sole around the contact point, in the frame, meters.
     """
 
@@ -74,7 +75,7 @@ class Support(_Table):
 
     @property
     def has_sole(self) -> bool:
-        """Whether the foot is a surface of known size."""
+        """Whether the foot is a ``surface`` with a ``size``."""
         return self.kind == "surface" and min(self.size) > 0
 
 
@@ -91,7 +92,7 @@ class ConstraintSpec(_Table):
 
 @dataclass(frozen=True)
 class LimitSpec(_Table):
-    """Limits that replace the limits of the URDF: rad or m, rad/s or m/s, N·m or N."""
+    """Limits by joint that replace the limits of the URDF: rad or m, rad/s or m/s, N·m or N."""
 
     position: dict[str, tuple[float, float]] = field(default_factory=dict)
     velocity: dict[str, Positive] = field(default_factory=dict)
@@ -109,7 +110,7 @@ class ArmatureSpec(_Table):
 
 @dataclass(frozen=True)
 class JointTransmissionSpec(_Table):
-    """Transmission of a joint; :class:`TransmissionSpec` provides missing values."""
+    """Transmission of a single joint; :class:`TransmissionSpec` provides missing values."""
 
     kind: TransmissionKind | None = None
     stiffness: Positive | None = None
@@ -144,7 +145,7 @@ class RotorSpec(_Table):
 
 @dataclass(frozen=True)
 class PropulsionSpec(_Table):
-    """The propellers of an aerial robot: thrust ``c_f ω²``, drag moment ``-spin · drag_ratio · thrust``."""
+    """The propellers of an aerial robot, with thrust ``c_f ω²`` and drag moment ``-spin · drag_ratio · thrust``."""
 
     frame: str
     thrust_coefficient: Positive
@@ -159,7 +160,7 @@ class PropulsionSpec(_Table):
 
 @dataclass(frozen=True)
 class RobotSpec(_Table):
-    """The whole ``robot.toml``."""
+    """Content of a ``robot.toml``."""
 
     schema: str = SCHEMA
     name: str | None = None
@@ -179,15 +180,15 @@ class RobotSpec(_Table):
 
 
 def read_spec(path: Path, over: Path | None = None) -> RobotSpec:
-    """Read and check a ``robot.toml``; the file ``over`` provides missing values, with paths relative to its folder.
+    """Read and check a ``robot.toml``.  The file ``over`` provides missing values.
 
-    A file that names its own URDF describes another robot, so it takes no values from ``over``.
+    If ``path`` names a URDF, it describes another robot, and ``over`` is ignored.
     """
     data = read_toml(path)
     model = data.get("model", {})
     if over is not None and not (isinstance(model, dict) and "urdf" in model):
         data = _overlay(_absolute_paths(read_toml(over), over.parent), data)
-    # Checked before the keys, because the keys of another schema are not misspelt.
+    # Check the schema before the keys, because keys of another schema are not misspelt.
     schema = data.get("schema", SCHEMA)
     if schema != SCHEMA:
         raise SpecError(f"schema '{shown(schema)}'", where=str(path), hint=f'write schema = "{SCHEMA}"')
@@ -195,7 +196,7 @@ def read_spec(path: Path, over: Path | None = None) -> RobotSpec:
 
 
 def _overlay(below: dict[str, object], above: dict[str, object]) -> dict[str, object]:
-    """Merge tables; replace lists, values, and armature and transmission as a whole."""
+    """Merge two tables recursively, but replace the tables ``armature`` and ``transmission`` as a whole."""
     merged = dict(below)
     for key, value in above.items():
         old = merged.get(key)

@@ -1,4 +1,4 @@
-"""Summary of a robot in JSON values, for the commands ``robots`` and ``inspect``."""
+"""Summaries of robots as JSON content, for the commands ``robots`` and ``inspect``."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ WAYS_TO_NAME = (
 
 
 def catalogue() -> list[dict[str, Any]]:
-    """Return an entry for each known robot, from its ``robot.toml`` alone."""
+    """Return a summary of each known robot; only its ``robot.toml`` is read."""
     entries = []
     for name in known_robots():
         spec = read_spec(robots_data() / name / "robot.toml")
@@ -106,7 +106,7 @@ def _family(joint: pin.JointModel) -> str:
 
 
 def _frames(robot: Robot) -> list[dict[str, Any]]:
-    """Return the frames of :meth:`Robot.frame_id`, one for each name."""
+    """Return the frame that :meth:`Robot.frame_id` selects for each name."""
     frames = [robot.model.frames[robot.frame_id(name)] for name in dict.fromkeys(robot.frame_names)]
     return [
         {
@@ -131,8 +131,7 @@ def _posture(robot: Robot, name: str) -> dict[str, Any]:
 def _actuation(robot: Robot, propulsion: PropulsionSpec) -> dict[str, Any]:
     """Return rank and condition of the allocation, and lateral force and hover at each posture.
 
-    The condition number mixes N and N·m.  The condition number is ``None`` below rank 6. The force is ``None``
-    without a level base.
+    The condition number is ``None`` if the rank is below 6.  The force is ``None`` if the base is not level.
     """
     model = robot.model
     rotors = allocation(model, propulsion)

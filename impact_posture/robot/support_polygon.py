@@ -8,16 +8,16 @@ import numpy as np
 
 from impact_posture.system.arrays import Array
 
-# Points nearer to a line than this (m) lie on it.  Number of digits to which edges are rounded.
+# Largest distance (m) of a point that lies on a line; number of decimals to which edges are rounded.
 _ROUNDING, _DIGITS = 1e-9, 12
 
 
 def convex_ring(points: Array) -> list[int]:
     """Return the corners of the convex hull of points, shape (k, 2), as indices, counter-clockwise.
 
-    Each chain of the hull follows the sorted points and leaves out points without a left turn (A. M. Andrew, "Another
-    efficient algorithm for convex hulls in two dimensions", Inf. Process. Lett. 1979).  The import of SciPy, which
-    has convex hulls, takes longer than many problems take to solve.
+    The lower and the upper chain follow the sorted points and keep only left turns (A. M. Andrew, "Another efficient
+    algorithm for convex hulls in two dimensions", Inf. Process. Lett. 1979).  SciPy is not used, because its import
+    takes longer than solving a typical problem.
     """
     order = np.lexsort((points[:, 1], points[:, 0])).tolist()
     x, y = points[:, 0].tolist(), points[:, 1].tolist()
@@ -36,15 +36,15 @@ def convex_ring(points: Array) -> list[int]:
 
 
 def polygon_edges(points: Iterable[Array]) -> tuple[Array, Array] | None:
-    """Return the edges ``n·p ≤ b`` of the convex hull of points, shape (2,) each, m; ``None`` without an area.
+    """Return the edges ``n·p ≤ b`` of the convex hull of points, shape (2,) each, m; ``None`` if the area is zero.
 
-    The edges are outward unit normals ``n``, shape (k, 2), and offsets ``b``, m, shape (k,).  Corners on the line
-    between their neighbors are left out.
+    The edges are outward unit normals ``n``, shape (k, 2), and offsets ``b``, m, shape (k,).  A corner on the line
+    between its neighbors is left out.
     """
     places = np.array(list(points), dtype=float).reshape(-1, 2)
     corners = [places[k] for k in convex_ring(places)]
     while len(corners) > 2:
-        # On the hull, a point near the line through its neighbors is also between them.
+        # A corner of the hull near the line through its neighbors lies between them.
         around = zip(np.roll(corners, 1, axis=0), np.roll(corners, -1, axis=0), corners, strict=True)
         heights = [_height(*points) for points in around]
         if min(heights) >= _ROUNDING:
@@ -55,12 +55,12 @@ def polygon_edges(points: Iterable[Array]) -> tuple[Array, Array] | None:
     steps = np.roll(corners, -1, axis=0) - corners
     normals = np.column_stack([steps[:, 1], -steps[:, 0]]) / np.linalg.norm(steps, axis=1)[:, None]
     offsets = (normals * corners).sum(axis=1)
-    # Rounded and sorted, so that feet in another order give the same edges.
+    # Round and sort the edges, so that feet in another order give the same edges.
     edges = np.unique(np.round(np.column_stack([normals, offsets]), _DIGITS), axis=0)
     return edges[:, :2], edges[:, 2]
 
 
 def _height(start: Array, end: Array, point: Array) -> float:
-    """Return the distance of a point to the right of a line, m; negative to the left."""
+    """Return the signed distance of a point from a line, m; positive on the right of the line."""
     along, off = end - start, point - start
     return float((along[1] * off[0] - along[0] * off[1]) / np.linalg.norm(along))

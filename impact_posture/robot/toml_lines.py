@@ -13,7 +13,7 @@ _WIDTH = 100
 
 @dataclass
 class Draft:
-    """Text of a ``robot.toml``, written line by line, and values that the user must check, one line each."""
+    """Lines of a ``robot.toml``, and a line for each guessed value, which the user must check."""
 
     lines: list[str] = field(default_factory=list)
     guesses: list[str] = field(default_factory=list)
@@ -32,12 +32,11 @@ class Draft:
             self.guesses.append(f"{line}: {why}")
 
     def note(self, text: str, *example: str) -> None:
-        """Add a comment, and lines that a user can uncomment."""
+        """Add a comment, and an example that a user can uncomment."""
         self.lines += ["", *comment_lines(text), *(f"# {line}" for line in example)]
 
 
 def comment_lines(text: str) -> list[str]:
-    """Return the lines of a comment."""
-    # Names may contain line breaks, which would end the comment.
+    """Return a text as lines of a TOML comment.  Line breaks in names are escaped."""
     wrapper = textwrap.TextWrapper(_WIDTH - 2, break_long_words=False, break_on_hyphens=False)
     return [f"# {line}" for line in wrapper.wrap(printable(text))]

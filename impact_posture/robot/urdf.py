@@ -16,9 +16,9 @@ import pinocchio as pin
 from impact_posture.errors import PackageNotFound, SpecError, UrdfError, nearest
 from impact_posture.robot.inertia_checks import check_inertias
 
-# pin.Data always holds 6 nv³ numbers: 0.4 GB at 200 degrees of freedom and 48 GB at 1,000.
+# pin.Data always contains 6 nv³ numbers: 0.4 GB at 200 degrees of freedom, and 48 GB at 1,000.
 MOST_DEGREES_OF_FREEDOM = 200
-# Joints from the root to a tip, with fixed joints; the URDF parser overflows the stack somewhere above 2,000.
+# Largest number of joints in a chain, including fixed joints.  Above 2,000, the URDF parser overflows the stack.
 _DEEPEST = 1_000
 
 EXAMPLE_PREFIX = "example-robot-data:"
@@ -47,12 +47,12 @@ def robots_data() -> Path:
 
 
 def resolve_path(text: str, base: Path) -> Path:
-    """Return the file of a path in robot.toml.
+    """Return the absolute path for a path in robot.toml.
 
-    The path is ``example-robot-data:<below robots/>``, absolute, or relative to ``base``.
+    ``text`` is ``example-robot-data:<path below robots/>``, an absolute path, or a path relative to ``base``.
 
     Raises:
-        PackageNotFound: There is no such file in the package; carries the nearest paths below ``robots/``.
+        PackageNotFound: The package example-robot-data has no such file.
         SpecError: The path contains a null character.
     """
     if "\0" in text:
@@ -76,14 +76,13 @@ def example_models(suffix: str = ".urdf") -> list[str]:
 def build_model(
     path: Path, *, free_flyer: bool, accept_inertias: bool = False
 ) -> tuple[pin.Model, tuple[str, ...], dict[str, str]]:
-    """Parse the URDF at ``path`` without opening meshes; return the model, warnings, and mimics.
+    """Parse a URDF without its meshes; return the model, warnings, and the mimicked joint of each mimicking joint.
 
-    The mimics are a dictionary from each mimicking joint to its mimicked joint.
-
-    ``free_flyer`` adds a free-flyer joint before the root link.  ``accept_inertias`` turns errors into warnings.
+    ``free_flyer`` adds a free-flyer joint before the root link.  With ``accept_inertias``, impossible inertias are
+    warnings instead of errors.
 
     Raises:
-        UrdfError: The file is missing or is not a URDF, Pinocchio rejects its tree, or it has too many joints.
+        UrdfError: The file is missing or is not a URDF, Pinocchio rejects it, or it has too many joints.
         InertiaError: A link has an impossible mass or inertia.
     """
     root = parse_urdf(path)
@@ -91,7 +90,7 @@ def build_model(
     try:
         with quiet_stderr() as errors:
             model = pin.buildModelFromUrdf(str(path), *([pin.JointModelFreeFlyer()] if free_flyer else []))
-    except Exception as error:  # Pinocchio raises ValueError, RuntimeError or IndexError, by version and fault.
+    except Exception as error:  # The type of exception differs between versions of Pinocchio.
         fault = f"makes no robot ({errors[0] or error})"
         raise UrdfError(fault, where=str(path), hint="correct the URDF") from None
     if model.nv == 0:
@@ -109,7 +108,7 @@ def build_model(
 
 
 def _check_depth(root: ET.Element, path: Path) -> None:
-    """Raise an error for deep trees and circles, because the URDF parser follows them until its stack overflows."""
+    """Raise an error for deep trees and cycles, in which the URDF parser overflows the stack."""
     joints = [(joint.find("parent"), joint.find("child")) for joint in root.findall("joint")]
     parents = {c.get("link"): p.get("link") for p, c in joints if p is not None and c is not None}
     children: dict[str | None, list[str | None]] = {}
@@ -128,7 +127,7 @@ def _check_depth(root: ET.Element, path: Path) -> None:
 
 
 def _mimics(root: ET.Element) -> tuple[dict[str, str], list[str]]:
-    """Return the mimicked joint of each mimicking joint, and a warning for each ``<mimic>`` without its joint."""
+    """Return the mimicked joint of each mimicking joint, and a warning for each ``<mimic>`` of an unknown joint."""
     joints = {joint.get("name", ""): joint.find("mimic") for joint in root.findall("joint")}
     mimics = {name: mimic.get("joint", "") for name, mimic in joints.items() if mimic is not None}
     lost = [
@@ -141,7 +140,7 @@ def _mimics(root: ET.Element) -> tuple[dict[str, str], list[str]]:
 
 
 def parse_urdf(path: Path) -> ET.Element:
-    """Return the root of the URDF at ``path``; raise ``UrdfError`` if it is missing or is not a URDF."""
+    """Return the root element of a URDF; raise ``UrdfError`` if the file is missing or is not a URDF."""
     if os.path.isdir(path):
         raise UrdfError("is a folder", where=str(path), hint="name the .urdf file in it")
     try:
@@ -162,9 +161,9 @@ def parse_urdf(path: Path) -> ET.Element:
 
 @contextlib.contextmanager
 def quiet_stderr() -> Iterator[list[str]]:
-    """Keep the output of the URDF parser off the terminal, and yield a list for its first error line."""
+    """Hide the error output of C++ libraries; after the block, the yielded list contains its first error line."""
     errors = [""]
-    # A file in memory if the system has them, because no folder may be writable.
+    # Prefer a file in memory, because possibly no folder is writable.
     in_memory = hasattr(os, "memfd_create")
     with os.fdopen(os.memfd_create("stderr"), "w+b") if in_memory else tempfile.TemporaryFile() as sink:
         saved = os.dup(2)
