@@ -1,4 +1,4 @@
-"""The robots known by name: a folder each, with ``robot.toml`` and, where it is ours, URDF and SRDF."""
+"""Robots that users load by name: each folder contains a ``robot.toml``, and some contain a URDF and SRDF."""
 
 from __future__ import annotations
 
@@ -6,4 +6,4 @@ from pathlib import Path
 from typing import Final
 
 DATA: Final = Path(__file__).resolve().parent
-"""Folder that holds ``<name>/robot.toml``."""
+"""Folder that contains ``<name>/robot.toml``."""

@@ -155,7 +155,7 @@ class Tree(Kinematics):
         """For every joint ``(pivot, D⁻¹Uᵀ, I^a = I^A − U D⁻¹Uᵀ)`` with ``U = I^A S``, ``D = SᵀU + armature``.
 
         ``I^A`` is the articulated inertia of the link (Featherstone 2008, chapter 7).  The pivot is ``1/D`` for a
-        joint with one axis, ``D`` for a joint with several axes, and zero for a locked joint, whose ``D`` is infinite.
+        joint with one axis, ``D`` for a joint with several axes, and zero for a locked joint (infinite ``D``).
         """
         articulated = dict(self._inertia)
         factors: dict[int, tuple[ca.SX, ...]] = {}
