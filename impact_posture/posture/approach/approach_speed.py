@@ -13,22 +13,22 @@ from impact_posture.posture.approach.attainable_speed import FASTEST, Attainable
 from impact_posture.posture.constraints.constraint import Constraint, LiftedRows, Linearization, digest
 from impact_posture.system.arrays import Array
 
-# Price (:attr:`Constraint.price`) per m/s by which the attainable speed is too low.  This price is lower than the
-# price of a meter.
+# Weight per m/s of missing speed in the search for conflicts (:attr:`Constraint.price`), lower than the weight of a
+# position error per m.
 _PRICE = 1e-3
 
 
 class ApproachSpeed(Constraint):
     """``s − σ(q) ≤ 0``: the joints can bring the contact to the surface at the speed s, m/s.
 
-    In the program, the joint velocities are unknowns, each in units of its limit.
+    The joint velocities, divided by their limits, are unknowns of the nonlinear program.
 
     Raises:
         InputError: There are too few joints to move the contact along the normal.
     """
 
     price = _PRICE
-    # Starts that are projected onto this constraint differ less from each other.
+    # Initial postures are not projected onto this constraint, so that they remain diverse.
     projected = False
 
     def __init__(self, attainable: AttainableSpeed, speed: float) -> None:
@@ -84,7 +84,7 @@ class ApproachSpeed(Constraint):
         return len(self._attainable.free)
 
     def guess(self, model: Numeric) -> Guess:
-        """Return the velocities of the fastest approach, scaled down to the required speed."""
+        """Return the joint velocities of the fastest approach, scaled down to the required speed."""
         attained, upper = self._attainable.at(model), self._attainable.upper
         slower = min(1.0, self._speed / min(attained.speed, FASTEST)) if attained.speed > 0 else 1.0
         return Guess(slower * attained.velocities, -upper, upper)

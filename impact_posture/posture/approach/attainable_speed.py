@@ -31,13 +31,14 @@ FASTEST = 1e3
 
 @dataclass(frozen=True, eq=False)
 class MovingPoint:
-    """Required motion of a point during the approach: chosen rows of ``D v`` and ``D ω`` equal ``−σ d``.
+    """Required motion of a point at approach speed σ: the constrained rows of ``(D v, D ω)`` equal ``−σ d``.
+
+    ``v`` and ``ω`` are the linear and angular velocity of the point in world axes.
 
     Attributes:
         axes: Matrix ``D``, shape (3, 3), whose rows are the normal and two tangents, or the axes of the world.
         rows: Indices of the constrained rows of ``(D v, D ω)``.
-        comes: Whether the point moves towards the surface, so that the first row is ``nᵀv = −σ``; otherwise all rows
-            are zero.
+        comes: Whether the point moves towards the surface.  If so, the first row is ``nᵀv = −σ``; if not, ``d`` is 0.
         in_frame: Whether the axes turn with the frame of the point; otherwise they are fixed in the world.
     """
 
@@ -78,8 +79,8 @@ class MovingPoint:
 class Attained:
     """The fastest approach at a posture; ``speed`` is ``σ``, m/s, infinite if no velocity limit bounds it.
 
-    ``velocities`` are the free entries of the generalized velocity at ``min(σ, FASTEST)``, divided by their scales,
-    shape (k,). ``gradient`` is the tangent gradient of the speed, shape (nv,).
+    ``velocities`` are the free velocities (:class:`AttainableSpeed`) at the speed ``min(σ, FASTEST)``, divided by
+    their scales, shape (k,).  ``gradient`` is the tangent gradient of the speed, shape (nv,).
     """
 
     speed: float
@@ -90,18 +91,18 @@ class Attained:
 class AttainableSpeed:
     """The largest σ(q) with ``nᵀJν = −σ`` for a generalized velocity within its limits, ``|ν_i| ≤ ν̄_i``.
 
-    The contact point moves only along the normal, and frames in ``keep`` do not move.  The contact frame turns only
-    if its pose allows this, or if there are too few joints to prevent a turn.  Several contacts all approach at the
-    speed ``σ`` and may also move tangentially.  The base and feet of a standing robot do not move.  The base of a
-    robot without feet can move at any speed.  A contact with a free pose is left out, because an object hits the
-    robot there.
+    The contact point moves only along the normal, and the frames in :attr:`Requirements.keep` do not move.  The
+    contact frame turns only if :attr:`Requirements.contact_pose` allows this, or if there are too few joints to
+    prevent a turn.  Several contacts all approach at the speed ``σ`` and may also move tangentially.  The base and
+    feet of a standing robot do not move.  The base of a robot without feet can move at any speed.  A contact whose
+    ``contact_pose`` is ``free`` is left out, because there an object hits the robot.
 
     Attributes:
         unknown: Reason why the speed is not computed; empty if it is computed.  A computed speed can still be
             infinite at some postures.
-        scale: Unit of each free entry of the velocity, rad/s or m/s, shape (k,).
-        upper: Velocity limit of each free entry from the URDF, divided by its scale, shape (k,); infinite if there is
-            no limit.
+        free: Indices of the free velocities, the entries of ``ν`` that may be nonzero, shape (k,).
+        scale: Unit of each free velocity, rad/s or m/s, shape (k,).
+        upper: Limit of each free velocity in this unit, shape (k,); infinite if the URDF has no limit.
     """
 
     def __init__(self, robot: Robot, objective: Objective, requirements: Requirements) -> None:
@@ -136,9 +137,9 @@ class AttainableSpeed:
 
     @property
     def independent(self) -> list[int]:
-        """Indices of independent rows.
+        """Indices of linearly independent rows of :meth:`jacobian`.
 
-        For example, a planar robot cannot leave its plane, so its rows for motion out of the plane are zero.
+        For example, a planar robot cannot leave its plane, so the rows for motion out of the plane are zero.
         """
         if not self.points:
             return []
@@ -150,16 +151,16 @@ class AttainableSpeed:
 
     @property
     def arrives(self) -> Array:
-        """Vector with 1 for rows of the approach and 0 for other rows, shape (m,)."""
+        """Vector ``d`` of all points, shape (m,): 1 for the approach, 0 for other rows."""
         return np.concatenate([point.arrives for point in self.points])
 
     def jacobian(self, model: Numeric) -> Array:
-        """Return the matrix that maps the scaled free velocities to the rows, shape (m, k)."""
+        """Return the matrix that maps the scaled free velocities to the rows of all points, shape (m, k)."""
         rows = np.vstack([point.jacobian(model) for point in self.points])
         return np.asarray(rows[:, self.free] * self.scale)
 
     def by_posture(self, model: Numeric, velocities: Array, weights: Array) -> Array:
-        """Return the tangent gradient, shape (nv,), of the sum of all rows, weighted by ``weights``, shape (m,)."""
+        """Return the tangent gradient, shape (nv,), of the sum of all rows with ``weights``, shape (m,)."""
         v = np.zeros(model.model.nv)
         v[self.free] = self.scale * velocities
         gradient = np.zeros(len(v))

@@ -16,8 +16,7 @@ class CenterOfMassOverFeet(ExpressionConstraint):
     """The center of mass stays above the feet: ``A xy − b ≤ −margin``, meters.
 
     ``normals`` are ``A``, the outward unit normals of the edges of the support polygon, shape (k, 2), and ``offsets``
-    are ``b``.  If ``loaded`` is given (a model and its name), the center of mass of this model is used instead of the
-    robot's.
+    are ``b``.  If ``loaded`` is given (a model and its name), the center of mass of this model is used.
     """
 
     def __init__(

@@ -37,14 +37,13 @@ _Lifted = WeakKeyDictionary[Tree, dict[int, tuple[Corners, LiftedRows]]]
 class Clearance(Constraint):
     """``distance(a, b) − clearance ≥ 0`` for pairs of bodies.
 
-    The program contains only active pairs.  :meth:`grown` adds pairs that a posture violates.
+    The program contains only active pairs.  :meth:`grown` adds pairs whose clearance a posture violates.
 
     Args:
         active: Maps the index of each pair in the program to the corners that have rows in the program.
-        lifted: Cache of the rows of pairs and their corners, by tree and index of the pair; shared with the
-            constraints that :meth:`grown` returns.
-        distances: Distances of all pairs of the surroundings, and the indices of the pairs of this constraint among
-            them.
+        lifted: Cache of the expressions of each pair, by kinematic tree and pair index; the constraints that
+            :meth:`grown` returns share this cache.
+        distances: Distances of all pairs of :class:`Surroundings`, and the indices of the pairs of this constraint.
     """
 
     projected = False
@@ -109,9 +108,9 @@ class Clearance(Constraint):
         return closest
 
     def grown(self, model: Numeric, auxiliaries: Array | None = None) -> Self:
-        """Add violated pairs, or further corners of pairs that are already in the program.
+        """Return a constraint whose program also contains violated pairs, or further corners of pairs.
 
-        If the slack of a pair exceeds half of the violation of the pair, no corners are added for this pair.
+        A pair with a slack above half of its violation gets no corners, because its present rows are violated too.
         """
         values, active = self.value(model), dict(self.active)
         unknowns = {} if auxiliaries is None else self._unknowns(auxiliaries)
@@ -122,9 +121,8 @@ class Clearance(Constraint):
             pair, old = self._pairs[k], active.get(k, Corners(frozenset(), frozenset()))
             if k in unknowns and pair.slack(unknowns[k]) > -values[k] / 2:
                 continue
-            # The plane of the program may differ from the plane between the closest points.  The plane of the program
-            # may then cut any corner without a row.  So all corners are added if the closest corners already have
-            # rows.
+            # If the closest corners already have rows, all corners are added: the plane of the program may differ
+            # from the plane between the closest points, and may then cut any corner without a row.
             for new in (pair.corners(model), pair.every_corner):
                 if not (new.a <= old.a and new.b <= old.b):
                     active[k] = Corners(old.a | new.a, old.b | new.b)
@@ -140,7 +138,7 @@ class Clearance(Constraint):
         return max((self._pairs[k].slack(z) for k, z in self._unknowns(auxiliaries).items()), default=0.0)
 
     def _unknowns(self, auxiliaries: Array) -> dict[int, Array]:
-        """Split the auxiliaries by pair; pairs that were added after the program was built are left out."""
+        """Split the auxiliary unknowns by pair, without pairs that were added after the program was built."""
         counts = [pair.count for _, pair, _ in self._program]
         parts = np.split(auxiliaries, np.cumsum(counts)[:-1]) if counts else []
         return {k: z for k, z in zip(self.active, parts, strict=True) if z.size}
@@ -155,9 +153,9 @@ class Clearance(Constraint):
         return slice(0) if first is None else slice(first, first + 4)
 
     def lift(self, tree: Tree, parameters: ca.SX) -> LiftedRows:
-        """Return the equations and rows of the active pairs.
+        """Return the equations and inequalities of the active pairs.
 
-        The expressions of the equations of a pair are reused while pairs and corners are added.
+        The equations of a pair are built once and reused when pairs or corners are added.
         """
         lifted = self._lifted.setdefault(tree, {})
         for k, pair, corners in self._program:

@@ -31,15 +31,15 @@ def digest(*parts: object) -> str:
 
 @dataclass(frozen=True, eq=False)
 class LiftedRows:
-    """A constraint in the unknowns of the program: ``lower ≤ g(q, z) ≤ upper`` with the auxiliaries z.
+    """A constraint in the nonlinear program: ``lower ≤ g(q, z) ≤ upper`` with auxiliary unknowns ``z``.
 
     Attributes:
         rows: Expression ``g(q, z)``, shape (m, 1).
-        variables: Symbols of the auxiliaries ``z``, shape (k, 1).
-        slack: Sum of the auxiliaries that relax rows, m; the program minimizes this sum to zero.
-        sides: Further rows that depend only on the auxiliaries ``z``, not on ``q``, shape (p, 1).
-        pieces: Pieces of a constraint to which parts can be added; the expression ``rows`` of each piece is then
-            reused.
+        variables: Symbols of ``z``, shape (k, 1).
+        slack: Sum of the entries of ``z`` that relax rows, m; a penalty drives this sum to zero.
+        sides: Further rows that depend only on ``z``, not on ``q``, shape (p, 1).
+        pieces: Pieces that are joined to this constraint; the expressions of unchanged pieces are reused when the
+            constraint grows.
     """
 
     rows: ca.SX
@@ -50,7 +50,7 @@ class LiftedRows:
 
     @staticmethod
     def joined(pieces: Sequence[LiftedRows]) -> LiftedRows:
-        """Join pieces: first the rows of all pieces, then the sides of all pieces."""
+        """Join pieces: first ``rows`` of all pieces, then ``sides`` of all pieces."""
         rows, sides, variables = (
             ca.vertcat(ca.SX(0, 1), *[getattr(piece, key) for piece in pieces])
             for key in ("rows", "sides", "variables")
@@ -61,14 +61,14 @@ class LiftedRows:
 
 @dataclass(frozen=True, eq=False)
 class Linearization:
-    """Linearized rows of a constraint near a posture, in the tangent space and the auxiliaries of the certificate.
+    """Rows of a constraint, linearized at a posture in the tangent space and in the auxiliary unknowns ``z``.
 
     Attributes:
         names: Name of each row.
         value: Value of ``g(q, z)``, shape (m,).
         lower, upper: Bounds of the rows, shape (m,).
         posture: Tangent Jacobian ``∂g/∂q``, shape (m, nv).
-        auxiliary: Jacobian ``∂g/∂z`` with respect to the auxiliaries, shape (m, k).
+        auxiliary: Jacobian ``∂g/∂z``, shape (m, k).
     """
 
     names: list[str]
@@ -85,7 +85,7 @@ class Linearization:
 
     @staticmethod
     def joined(parts: Sequence[Linearization], nv: int) -> Linearization:
-        """Join the rows of several linearizations, each with its own auxiliaries."""
+        """Stack the rows of linearizations that share no auxiliary unknowns."""
         # Leave out empty parts.  Most parts are empty, because most postures are far from most bounds.
         parts = [part for part in parts if part.names or part.auxiliary.shape[1]]
         if len(parts) == 1:
@@ -113,11 +113,11 @@ class Constraint(ABC):
         name: Name of the constraint in lists of active or conflicting constraints.
         parameters: Numbers that can change without rebuilding the program, for example targets and polygons.
         lower, upper: Bounds, shape (rows,).
-        projected: Whether starts are projected onto the constraint; otherwise only the program enforces it.
-        grows: Whether :meth:`grown` is likely to add parts to the program.
+        projected: Whether initial postures are projected onto the constraint before the program is solved.
+        grows: Whether :meth:`grown` is likely to add rows to the program.
         by_row: Whether a conflict is reported for each row instead of for the whole constraint.
-        price: Price per unit of violation in the search for conflicts.  If constraints conflict, the constraint with
-            the lowest price is violated and therefore reported.
+        price: Weight per unit of violation in the search for conflicts.  If constraints conflict, the constraint with
+            the lowest weight is violated and therefore reported.
     """
 
     name: str
@@ -154,7 +154,7 @@ class Constraint(ABC):
 
     @abstractmethod
     def lift(self, tree: Tree, parameters: ca.SX) -> LiftedRows:
-        """Return the rows of the program with their auxiliaries; ``tree`` is built with ``chart_x``."""
+        """Return the rows for the nonlinear program; ``tree`` has the argument ``chart_x`` of :class:`Kinematics`."""
 
     @property
     def lifted_bounds(self) -> tuple[Array, Array]:
@@ -163,15 +163,15 @@ class Constraint(ABC):
 
     @property
     def unknowns(self) -> int:
-        """Number of auxiliaries."""
+        """Number of auxiliary unknowns ``z``."""
         return 0
 
     def guess(self, model: Numeric) -> Guess:
-        """Return initial values and bounds of the auxiliaries at ``model.q``."""
+        """Return initial values and bounds of the auxiliary unknowns at ``model.q``."""
         return Guess(np.zeros(0), np.zeros(0))
 
     def linearize(self, model: Numeric, auxiliaries: Array) -> Linearization:
-        """Linearize the rows at ``model.q`` and ``auxiliaries``, shape (k,).
+        """Linearize the rows at ``model.q`` and at ``z = auxiliaries``, shape (k,).
 
         Rows that are far from their bounds may be left out of the result.
         """
@@ -180,15 +180,14 @@ class Constraint(ABC):
         return Linearization(names, value, self.lower, self.upper, jacobian, np.zeros((self.rows, 0)))
 
     def grown(self, model: Numeric, auxiliaries: Array | None = None) -> Self:
-        """Add the parts that the program lacks at ``model.q``; return the same constraint if no parts are missing.
+        """Return the constraint with the rows that the program lacks at ``model.q``, or ``self`` if none are missing.
 
-        If ``model.q`` is the final posture of a run, ``auxiliaries`` are the final auxiliaries of this run, shape
-        (k,).
+        If ``model.q`` is the final posture of a solver run, ``auxiliaries`` is the final ``z``, shape (k,).
         """
         return self
 
     def slack(self, auxiliaries: Array) -> float:
-        """Return the slack, m, from the final ``auxiliaries`` of a run, shape (k,)."""
+        """Return the slack, m, for the final ``z = auxiliaries`` of a solver run, shape (k,)."""
         return 0.0
 
     def excess(self, value: Array) -> Array:
@@ -215,11 +214,11 @@ class Constraint(ABC):
 
 
 class ExpressionConstraint(Constraint):
-    """Abstract base class of constraints that depend on the posture only, without auxiliaries."""
+    """Abstract base class of constraints without auxiliary unknowns."""
 
     @abstractmethod
     def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
-        """Return ``c(q)`` as an expression, shape (rows, 1); ``tree`` is built with ``chart_x``."""
+        """Return ``c(q)`` as an expression, shape (rows, 1), with ``tree`` as in :meth:`Constraint.lift`."""
 
     def lift(self, tree: Tree, parameters: ca.SX) -> LiftedRows:
         return LiftedRows(self.symbolic(tree, parameters))

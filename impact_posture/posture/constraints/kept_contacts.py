@@ -24,8 +24,8 @@ class KeptContacts(ExpressionConstraint):
     The support impulses of rigid feet are not always unique
     (:mod:`impact_posture.impact.friction.contact_stability`).  The impulses ``f`` of feet with compliance ε are one
     of the possible solutions.  The constraint is therefore sufficient for the feet to stay, but stricter than
-    necessary if there are several solutions.  ``A`` is scaled so that the largest impulse at the given posture is 1.
-    ``numeric`` is the model at the given posture.  It gives the axes of the soles, which do not change.
+    necessary if there are several solutions.  ``numeric`` is the model at the given posture.  This posture defines
+    the axes of the soles, which do not change, and the scale of ``A``: the largest impulse there is 1.
     """
 
     def __init__(self, objective: WorstCaseObjective, numeric: Numeric, friction: float, variant: str = "") -> None:

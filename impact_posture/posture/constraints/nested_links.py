@@ -16,7 +16,7 @@ from impact_posture.system.arrays import Array
 class NestedLinks(ExpressionConstraint):
     """``N θ ≤ b`` for the joints ``θ`` between two links (:class:`JointPlanes`).
 
-    Each joint coordinate is scaled by half of the joint's range, so violations are relative to this half range.
+    Each joint coordinate is divided by half of the joint range, so violations are relative to this half range.
     """
 
     def __init__(self, robot: Robot, planes: JointPlanes) -> None:

@@ -1,4 +1,4 @@
-"""Distances of many pairs of bodies: exact for near pairs, and lower bounds, fast to compute, for others."""
+"""Distances of many pairs of bodies: exact for near pairs, and fast lower bounds for distant pairs."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from impact_posture.system.arrays import Array
 
 
 class PairDistances:
-    """Distances minus the clearance of pairs of bodies, at one posture after another.
+    """Distances of pairs of bodies, minus the clearance, for a sequence of postures.
 
-    Most pairs are far from each other, which three fast lower bounds show.  The first is the distance of balls around
+    Three fast lower bounds show that most pairs are far apart.  The first bound is the distance between balls around
     the bodies.  The second is the last exact distance minus the motion of the bodies since then.  The third is the
-    gap between the hulls along two directions.  The values at the last posture are stored, because a search evaluates
-    a posture several times.
+    larger gap between the hulls along two directions.  The values at the last posture are stored, because a search
+    evaluates a posture several times.
     """
 
     def __init__(self, pairs: Sequence[SeparatingPlane]) -> None:
@@ -30,7 +30,7 @@ class PairDistances:
         where = {key: k for k, key in enumerate(bodies)}
         self._first = np.array([where[id(pair.a)] for pair in self._pairs], dtype=int)
         self._second = np.array([where[id(pair.b)] for pair in self._pairs], dtype=int)
-        # The axes of a body that does not turn with its link are the world axes.
+        # Bodies that do not turn with their link have world axes.
         self._turns = np.array([body.turns for body in self._bodies], dtype=bool)[:, None, None]
         self._joints, self._on = np.unique([body.point.joint for body in self._bodies], return_inverse=True)
         still = np.where(self._turns[:, 0], 0.0, 1.0)
@@ -51,13 +51,11 @@ class PairDistances:
         self._planes = [(k, body) for k, body in enumerate(self._bodies) if body.normal is not None]
         self._offsets = np.array([body.offset for body in self._bodies])
         self._known = np.array([pair.known for pair in self._pairs], dtype=bool)
-        # The last exact distance of each pair of hulls, its normal, and the placements of both bodies for which it
-        # was computed.
+        # The last exact distance of each pair of hulls, with its normal and both placements at that time.
         self._latest = np.full(len(self._pairs), -np.inf)
         self._normals = np.zeros((len(self._pairs), 3))
         self._then = np.zeros((2, len(self._pairs), 12))
-        # The last posture, and at this posture: axes and centers of the bodies, normals of planes, and distances or
-        # bounds.
+        # The last posture, with axes and centers of bodies, normals of planes, and distances or bounds.
         self._q = np.zeros(0)
         self._axes, self._centers = np.zeros((0, 3, 3)), np.zeros((0, 3))
         self._up = np.zeros((len(self._bodies), 3))
@@ -65,7 +63,7 @@ class PairDistances:
         self._exact = np.zeros(len(self._pairs), dtype=bool)
 
     def bounds(self, model: Numeric, pairs: range) -> Array:
-        """Return lower bounds, m, on the distances of ``pairs`` from a ball around each body."""
+        """Return lower bounds of the distances of ``pairs``, m, computed with a ball around each body."""
         self._move(model)
         return np.array(self._balls[pairs.start : pairs.stop])
 
@@ -109,12 +107,12 @@ class PairDistances:
         self._values = self._balls.copy()
 
     def _places(self, bodies: Array) -> Array:
-        """Return, for each body, the rotation matrix times the reach, and the center, shape (k, 12)."""
+        """Return, for each body, the rotation matrix times the ball radius, and the center, shape (k, 12)."""
         axes = self._axes[bodies] * self._reach[bodies][:, None, None]
         return np.hstack([axes.reshape(-1, 9), self._centers[bodies]])
 
     def _along(self, pairs: NDArray[np.intp]) -> Array:
-        """Return the gaps of pairs along the normal of the plane, or the larger gap along two directions, m."""
+        """Return the gap of each pair, m: along the normal of a plane, or the larger gap along two directions."""
         first, second = self._first[pairs], self._second[pairs]
         apart = self._centers[first] - self._centers[second]
         # The two directions are the line between the centers and the normal of the last exact distance.
@@ -126,8 +124,7 @@ class PairDistances:
         low = (self._corners[first] @ (self._axes[first].transpose(0, 2, 1) @ along)).min(axis=1)
         high = (self._corners[second] @ (self._axes[second].transpose(0, 2, 1) @ along)).max(axis=1)
         gaps = (apart[:, None] @ along)[:, 0] + low - high
-        # If the distance of a pair was never computed exactly, its normal is zero, and the gap along this normal is
-        # not used.
+        # A pair without an exact distance so far has the normal zero, and the gap along this normal is not used.
         best = np.where(self._normals[pairs].any(axis=1), gaps.max(axis=1), gaps[:, 0])
         return np.asarray(best - self._gaps[pairs] - self._offsets[second])
 
@@ -141,6 +138,6 @@ def _corners(body: ConvexBody) -> Array:
 
 
 def _moved(now: Array, then: Array) -> Array:
-    """Bound how far each body moved between two results of ``_places``: ``|Δc| + |ΔR| r``, m, shape (k,)."""
+    """Return ``|Δc| + |ΔR| r``, m, shape (k,): bounds on the motion between two results of ``_places``."""
     change = (now - then) ** 2
     return np.asarray(np.sqrt(change[:, 9:].sum(axis=1)) + np.sqrt(change[:, :9].sum(axis=1)))

@@ -33,7 +33,7 @@ class HeldPosition(ExpressionConstraint):
         return np.asarray(model.placement(self.point).translation - self.parameters)
 
     def pose_error(self, value: Array) -> tuple[float, float]:
-        """Return the distance from the target, or from the box around the target, m, and a zero orientation error."""
+        """Return the distance from the target or its box, m, and a zero orientation error."""
         return float(np.linalg.norm(self.excess(value))), 0.0
 
 
@@ -55,11 +55,11 @@ class PositionBox(HeldPosition):
 class HeldOrientation(ExpressionConstraint):
     """The frame keeps its world orientation ``target``, shape (3, 3), or only the direction of one axis.
 
-    The rows are ``2 vec(Q_left* ⊗ Q(q) ⊗ Q_right)``, the vector part of the error quaternion.  To first order, the
-    rows are the rotation vector of the error, rad.  The error is zero only at the target and largest at 180°, where a
-    skew-symmetric error is zero again.  If ``axis``, a vector in the frame, is given, only the first two components
-    are rows.  The direction of ``axis`` is then constrained, and the frame may turn about ``axis``.  If ``axis`` is
-    ``None``, all three components are rows.
+    The rows are twice the vector part of the error quaternion ``Q_right* ⊗ Q_target* ⊗ Q(q) ⊗ Q_right``.  To first
+    order, they are the rotation vector of the error, rad.  The error is zero only at the target and largest at 180°,
+    where a skew-symmetric error is zero again.  If ``axis``, a vector in the frame, is given, ``Q_right`` turns z to
+    ``axis``, and only the first two components are rows.  The frame may then turn about ``axis``.  If ``axis`` is
+    ``None``, ``Q_right`` is the identity, and all three components are rows.
     """
 
     def __init__(self, name: str, point: PointOnLink, target: Array, axis: Array | None = None) -> None:
@@ -103,7 +103,7 @@ class HeldOrientation(ExpressionConstraint):
 
 
 class HeldPose(ExpressionConstraint):
-    """The frame keeps its position and orientation, with six rows, or five if it may spin about ``axis``."""
+    """The frame keeps its position and orientation (six rows), or may spin about ``axis`` (five rows)."""
 
     def __init__(self, name: str, point: PointOnLink, target: pin.SE3, axis: Array | None = None) -> None:
         self.name = name

@@ -16,11 +16,11 @@ from impact_posture.system.arrays import Array
 
 
 def distance_squared(chart: Chart, q: Any, reference: Any) -> Any:
-    """Return the squared distance of two configurations (``SX`` or ``DM``), about ``‖q ⊖ reference‖²`` in rad and m.
+    """Return the squared distance of two configurations (``SX`` or ``DM``), approximately ``‖q ⊖ reference‖²``.
 
-    The distance is smooth everywhere.  A turn by Δ of a base, a ball joint or a continuous joint adds ``4 sin²(Δ/2) =
-    4 (1 − (quaternion·quaternion)²) = 2 (1 − cos Δ)``.  For other joints and for position coordinates, a change by Δ
-    adds Δ².
+    The distance, in rad and m, is smooth everywhere.  A turn by Δ of a base, a ball joint or a continuous joint adds
+    ``4 sin²(Δ/2) = 4 (1 − (quaternion·quaternion)²) = 2 (1 − cos Δ)``.  For other joints and for position
+    coordinates, a change by Δ adds Δ².
     """
     parts = []
     for slot in chart.slots:
@@ -63,10 +63,9 @@ def distance_gradient(chart: Chart, q: Array, reference: Array) -> Array:
 
 
 class WithinDistance(ExpressionConstraint):
-    """``distance_squared(q, reference) ≤ radius²``: the posture stays in a ball, about ``‖q ⊖ reference‖ ≤ radius``.
+    """``distance_squared(q, reference) ≤ radius²``: the posture stays near the reference.
 
-    The radius (> 0) is a bound and the reference a parameter, so one program can be used for all radii and
-    references.
+    The radius (> 0) is a row bound and the reference is a parameter, so one program serves all radii and references.
     """
 
     def __init__(self, chart: Chart, reference: Array, radius: float) -> None:

@@ -1,4 +1,4 @@
-"""Requirements of a task on the posture, from which the constraints are built."""
+"""Data class for what a task requires of the posture; the constraints are built from these requirements."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ class Requirements:
     """Requirements of the task on the posture.
 
     Attributes:
-        contact_pose: Part of the pose of the first contact frame that must not change; same values as the setting
+        contact_pose: What is constrained in the pose of the first contact frame; same values as the setting
             ``contact_pose``.
-        other_poses: Part of the pose that must not change, for each other contact frame.
+        other_poses: The same for each further contact frame.
         target_position: Target position of the contact frame, world axes, m; ``None`` for its initial position.
         target_quaternion: Target orientation of the contact frame, x y z w; ``None`` for its initial orientation.
         box: Half extents of the box in which the contact frame must stay if ``contact_pose`` is ``box``, m.
@@ -33,8 +33,8 @@ class Requirements:
         com_margin: Least horizontal distance of the center of mass from the edges of the support polygon, m.
         keep_contacts: Whether the feet must neither lift off nor slide during the impact.
         holdable: Whether thrusts, torques and foot forces within their limits must be able to hold the posture.
-        limit_share: Share of the torque and thrust ranges that may be used to hold the posture, around the middle of
-            each range.
+        limit_share: Fraction of each torque and thrust range, around its middle, that may be used to hold the
+            posture.
         hold_force: Force of the surface on each contact after the impact, N; the robot must also be able to hold its
             posture under this force.
         least_mobility: Least allowed G of each contact, 1/kg, from the bound on the peak force; 0 for no bound.

@@ -1,8 +1,8 @@
-"""A plane that separates two bodies and so proves that they do not touch; its coefficients are unknowns.
+"""Keep two bodies apart by a separating plane with unknown coefficients.
 
 Two convex bodies do not touch if a plane separates them (S. Boyd and L. Vandenberghe, Convex Optimization, 2004,
-section 2.5).  With the plane ``{y: n·y = c}`` in the axes of body b, sweep radii r and the clearance δ, corners x of
-a and y of b satisfy::
+section 2.5).  Let ``{y: n·y = c}`` be a plane in the axes of body b, r the sweep radii and δ the clearance.  The
+corners x of body a and the corners y of body b satisfy::
 
     m·x + d + s ≥ r_a + r_b + δ,      n·y − c ≤ 0,      n·n ≤ 1,
     m = Qᵀn,   d = n·t − c            (Q, t: placement of a in the axes of b)
@@ -33,14 +33,13 @@ EQUATIONS = 4
 # Lower bound on n·n.  Without this lower bound, the normal n could shrink to zero if bodies penetrate each other, and
 # the solver could not continue.
 _SHORT = 0.8
-# Initially, the slack exceeds the penetration by the first value (m), and the normal has the second value as length.
-# Slack and normal then start inside their bounds.
+# Initial slack minus penetration (m), and initial length of the normal.  Both values start inside their bounds.
 _ABOVE, _LENGTH = 0.01, 0.98
-# Unit of the unknown slack, m.  In this unit and with the usual price of a meter, the multiplier of the slack is one,
-# the initial guess of IPOPT. With this unit, a run takes a quarter fewer iterations than with meters.
+# Unit of the unknown slack, m: one divided by ``SLACK_PRICE`` in ``posture_nlp.py``.  The multiplier of the slack is
+# then one, which is the initial guess of IPOPT, and a run takes a quarter fewer iterations than with meters.
 _UNIT = 0.02
-# A corner gets a row if it is the first that the plane touches, either untilted or tilted towards one of eight sides.
-# The tangent of the tilt angle is this value.
+# A corner gets a row if it is the closest to the plane, either untilted or tilted to one of eight sides.  This value
+# is the tangent of the tilt angle.
 _TILT = 0.5
 _AROUND = np.array([[0.0, 0.0], *[[np.cos(a), np.sin(a)] for a in np.arange(8) * np.pi / 4]])
 # A plane separates two bodies if it cuts less than this (m) into a body. The certificate accepts twice this value.
@@ -240,7 +239,7 @@ class SeparatingPlane:
         return Guess(values, lower)
 
     def _plane(self, at_b: pin.SE3, relative: pin.SE3, normal: Array) -> tuple[Array, float]:
-        """Return ``n, c``, in the axes of ``b``, of the plane midway between the bodies with this world normal."""
+        """Return ``n, c``, in the axes of ``b``, of the plane midway between the bodies, given its world normal."""
         if self.b.normal is not None:
             return self.b.normal, self.b.offset
         n = normal @ at_b.rotation

@@ -60,7 +60,7 @@ class Surroundings:
         self.notes: list[str] = list(self.shapes.warnings)
         if touching := self.shapes.always_touching:
             pairs = [*(" / ".join(pair) for pair in touching[:3]), *["…"] * (len(touching) > 3)]
-            text = "pairs of shapes may touch, because they touch at most postures"
+            text = "pairs of shapes may touch, because they touch at the default posture and most others"
             self.notes.append(f"{len(touching)} {text}: {', '.join(pairs)}")
 
     def add_ground(self, supports: Sequence[Support], struck: Sequence[ImpactContact]) -> None:
@@ -188,7 +188,7 @@ class Surroundings:
         }
 
     def collisions(self, q: Array) -> list[tuple[str, str]]:
-        """Return the pairs of original shapes, surface, ground and obstacles that touch at ``q``."""
+        """Return the pairs of bodies (original link shapes, surface, ground, obstacles) that touch at ``q``."""
         planes, solids = self.walls_at(q)
         return self._meshes.collisions(q, solids, planes)
 
@@ -217,7 +217,7 @@ class Surroundings:
         return planes, solids
 
     def _stands_behind(self, plane: ConvexBody, exempt: frozenset[int]) -> str:
-        """Return the name of a fixed body behind a plane, for example a foot or the base; empty if no body is."""
+        """Return the name of a fixed body behind a plane, for example a foot or the base, or an empty text."""
         still = self._still | self._rigid([0])
         for body in self._bodies:
             joint = body.point.joint

@@ -105,8 +105,8 @@ def retarget(
     """Return the problem with another target of its only contact frame; the program stays the same.
 
     The target is a position in world axes, m, and a quaternion x y z w.  If ``position`` or ``quaternion`` is
-    ``None``, its initial value is the target. If the caller passes a model ``numeric``, its state changes to the
-    given posture.
+    ``None``, the initial position or orientation is the target.  A model ``numeric`` that the caller passes is set to
+    the given posture.
 
     Raises:
         InputError: The contact pose is free and cannot have a target, or the quaternion does not have unit length.
@@ -172,7 +172,7 @@ def _held_support(robot: Robot, numeric: Numeric, support: Support) -> Constrain
 
 
 def contact_target(robot: Robot, contact: ImpactContact, numeric: Numeric, requirements: Requirements) -> pin.SE3:
-    """Return the target pose of a contact frame; parts without a target keep their value at ``numeric.q``."""
+    """Return the target pose of a contact frame; without targets, it is the pose at ``numeric.q``."""
     placement = numeric.placement(point_on(robot, contact.frame)).copy()
     if requirements.target_position is not None:
         placement.translation = np.array(requirements.target_position)
@@ -241,7 +241,7 @@ def _com_constraint(
 
 
 def _bounds(chart: Chart, given: Array, requirements: Requirements) -> tuple[Array, Array]:
-    """Return the joint limits reduced by the margin, chart coordinates, shape (nx,); held joints get equal limits."""
+    """Return the joint limits minus the margin, in chart coordinates, shape (nx,); held joints have equal limits."""
     lower, upper = chart.bounds()
     x = chart.to_x(given)
     margin = requirements.limit_margin

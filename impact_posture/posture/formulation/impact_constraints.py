@@ -27,7 +27,7 @@ def impact_constraints(
         InputError: The feet must stay in place, but the contacts can also pull.
     """
     if requirements.keep_contacts and objective.bilateral:
-        fault = "contacts that pull as well as push would be allowed only if the feet get no impulse"
+        fault = "with contacts that pull as well as push, the feet stay only if they get no impulse"
         raise InputError(fault, where="keep_contacts", hint="leave out `bilateral` or `keep_contacts`")
     added: list[Constraint] = []
     centers = [constraint for constraint in constraints if isinstance(constraint, CenterOfMassOverFeet)]
@@ -42,6 +42,6 @@ def impact_constraints(
             added += [KeptContacts(single, numeric, requirements.friction, name) for single in member.singles]
         limits = requirements.least_mobility, requirements.largest_jump
         bounds = [ImpactBounds(single, *limits, name) for single in member.singles]
-        # A bound has no rows if there are no limits, or if all joints are locked.
+        # ImpactBounds has no rows if the settings limit nothing, or if all joints are locked.
         added += [bound for bound in bounds if bound.rows]
     return added

@@ -26,7 +26,7 @@ from impact_posture.robot.urdf import EXAMPLE_PREFIX
 from impact_posture.system.escape import toml
 
 _FILES = ("srdf", "config")
-# For each option, the keys of the file that it replaces in addition to its own key.
+# For each option on the command line, further keys of the file that the option replaces.
 _REPLACED_BY = {
     "frame": ("contact",),
     "normal": ("contact",),
@@ -35,13 +35,13 @@ _REPLACED_BY = {
     "contact_stiffness": ("contact_duration",),
     "posture": ("q",),
 }
-# Requirements that depend on the robot and on the setting with the same name.
+# Fields of Requirements that depend on the robot and on the setting with the same name.
 _WORKED_OUT = {"contact_pose", "base", "hold", "com_margin", "limit_margin"}
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """A problem that is ready to be solved, with the merged settings of file and command line, and their impact."""
+    """A problem that is ready to be solved, with its settings and the impact that they define."""
 
     settings: ProblemSettings
     impact: ResolvedImpact
@@ -61,7 +61,7 @@ def read_settings(path: Path, over: dict[str, object] | None = None) -> ProblemS
 
 
 def prepare(settings: ProblemSettings, impact: ResolvedImpact | None = None) -> Prepared:
-    """Resolve all defaults, also the impact if it is ``None``, and build the problem without solving it.
+    """Resolve all defaults and build the problem without solving it; ``None`` resolves the impact from ``settings``.
 
     Raises:
         ImpactPostureError: A setting is wrong; the error describes the first wrong setting in one line.
@@ -69,7 +69,7 @@ def prepare(settings: ProblemSettings, impact: ResolvedImpact | None = None) -> 
     impact = resolve(settings) if impact is None else impact
     if impact.robot.joint_model == "elastic":
         fault = "the joint model elastic only predicts the impact at one given posture"
-        hint = "optimize with link or reflected, depending on the number x, and evaluate the optimum with elastic"
+        hint = "optimize with the joint model link or reflected, and evaluate the optimum with elastic"
         raise InputError(fault, where="joint_model", hint=hint)
     if settings.q is not None:
         impact = replace(impact, q=impact.robot.check_posture(np.array(settings.q), where="q"))
@@ -81,7 +81,7 @@ def prepare(settings: ProblemSettings, impact: ResolvedImpact | None = None) -> 
     problem = build_problem(impact.robot, impact.objective, impact.q, requirements(settings, impact.objective))
     released = [joint for joint in _held_by_default(impact.robot) if joint not in problem.requirements.hold]
     if released:
-        note = f"robot.toml also holds {', '.join(released)}; your `hold` replaces its list, so they are free"
+        note = f"robot.toml also holds {', '.join(released)}; your `hold` replaces its list, so these joints are free"
         problem = replace(problem, notes=(note, *problem.notes))
     return Prepared(settings, impact, problem)
 
@@ -149,10 +149,10 @@ def _least_mobility(settings: ProblemSettings) -> float:
 
 
 def _largest_jump(settings: ProblemSettings) -> float:
-    """Return the largest allowed jump of a joint per approach speed, from ``max_joint_jump`` and ``max_torque``."""
+    """Return the largest allowed velocity jump of a joint per approach speed; infinite if there is no bound."""
     if (settings.max_torque is None) != (settings.velocity_gain is None):
-        fault = "bounds the velocity gain times the jump of a joint, so each of the two needs the other"
-        hint = "give `max_torque` and `velocity_gain`, or none of them"
+        fault = "limits the product of `velocity_gain` and the velocity jump of a joint, so both settings are needed"
+        hint = "give both `max_torque` and `velocity_gain`, or neither"
         raise InputError(fault, where="max_torque" if settings.velocity_gain is None else "velocity_gain", hint=hint)
     jumps = [] if settings.max_joint_jump is None else [settings.max_joint_jump]
     if settings.max_torque is not None and settings.velocity_gain is not None:

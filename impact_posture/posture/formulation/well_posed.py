@@ -24,8 +24,8 @@ from impact_posture.posture.program.constrained_problem import (
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array, independent_rows, null_space
 
-# Angle of a trial turn (rad), and the share of this angle that must remain after a projection if the turn is
-# possible.
+# Angle of a trial turn (rad), and the fraction of this angle that must remain after the projection of a possible
+# turn.
 _TRIAL, _SURVIVES = 0.05, 0.1
 # Number of random feasible postures at which ranks are compared.
 _SAMPLES = 4
@@ -42,8 +42,7 @@ def fix_undetermined_motions(
 
     Some motions of the whole robot, such as translations, do not change the objective.  If the constraints allow a
     motion that does not change the objective, this motion of the base is fixed.  If the contact pose is free and the
-    robot has no feet, yaw is fixed as well.  A turn of the whole robot relative to the impact would not change the
-    posture.
+    robot has no feet, yaw is fixed as well, because a turn of the whole robot leaves its joint positions unchanged.
     """
     if not robot.floating:
         return [], []
@@ -140,12 +139,11 @@ def _only_to_first_order(problem: ConstrainedProblem, numeric: Numeric, turn: He
 
 
 def _independent_rows(problem: ConstrainedProblem, numeric: Numeric) -> tuple[tuple[int, ...], ...]:
-    """Return the row indices of each constraint for the program: all inequalities and independent equalities."""
+    """Return, for each constraint, the indices of its rows in the program; dependent equality rows are left out."""
     held = held_rows(problem.robot, problem.requirements.hold).sum(axis=0) > 0
     equalities = [(index, c) for index, c in enumerate(problem.constraints) if c.equality]
     labels = [(index, row) for index, c in equalities for row in range(c.rows)]
-    # The rows are multiplied by the price of their constraint.  Among redundant rows, rows with a low price are then
-    # omitted first.
+    # The rows are multiplied by ``Constraint.price``, so that redundant rows with a low price are omitted first.
     stacked = np.vstack([c.price * c.evaluate(numeric)[1] for _, c in equalities])
     stacked[:, held] = 0.0
     chosen = {labels[k] for k in independent_rows(stacked, RANK_TOLERANCE)}

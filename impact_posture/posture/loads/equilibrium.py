@@ -1,4 +1,4 @@
-"""Forces that hold a robot at rest, chosen to minimize the largest share of an actuator limit."""
+"""Forces that hold a robot at rest and minimize the largest share of its limit that an actuator uses."""
 
 from __future__ import annotations
 
@@ -12,10 +12,9 @@ from impact_posture.posture.loads.static_load import ForceSource, StaticLoad
 from impact_posture.posture.program.linear_program import solve_linear
 from impact_posture.system.arrays import Array
 
-# A share that differs from the largest share by less than this is treated as equal to the largest share.
+# Shares (:class:`Equilibrium`) are treated as equal to the largest share if they differ from it by less than this.
 _TIED = 1e-9
-# Maximum number of iterations that leave out feet with pulling forces, when forces close to an even distribution are
-# computed.
+# Maximum number of iterations of ``_even_share``, each of which removes feet that would have to pull.
 _TURNS = 4
 # A load factor λ above this value is reported as infinite.
 _MOST = 1e6
@@ -27,11 +26,11 @@ class Distribution:
 
     Attributes:
         forces: Vector ``z`` of the forces of rotors and feet, in units of the robot's weight, shape (k,).
-        shares: Signed share of its limit that each actuator uses, 0 in the middle of its range, shape (actuators,).
+        shares: Signed share of its limit that each actuator uses (:class:`Equilibrium`), shape (actuators,).
         unbalanced: Sum of the absolute entries of the unbalanced wrench on the base; zero if the base is balanced.
             Forces are in units of the robot's weight, moments in units of the weight times 1 m.
-        jacobian: Tangent Jacobian of ``unbalanced`` and the absolute shares, shape (1 + actuators, nv).  If the
-            forces can be chosen, only the rows of the largest share or of ``unbalanced`` are computed.
+        jacobian: Tangent Jacobian of ``unbalanced`` and the absolute shares, shape (1 + actuators, nv).  With
+            unknown forces, it has nonzero rows only for the largest shares, or for ``unbalanced`` if it is not zero.
     """
 
     forces: Array
@@ -41,7 +40,7 @@ class Distribution:
 
     @property
     def largest(self) -> float:
-        """The largest share."""
+        """Largest absolute share."""
         return float(np.abs(self.shares).max(initial=0.0))
 
 
@@ -60,9 +59,9 @@ class Thrusts:
 
 
 class Equilibrium:
-    """Rows ``R τ(q, z) + r`` for a robot at rest: first the balance of the base (= 0), then shares of limits.
+    """Rows ``R τ(q, z) + r`` for a robot at rest: first the balance of the base (= 0), then the actuator shares.
 
-    A share is 0 in the middle of the range of an actuator, and ±1 at its limits.
+    The share of an actuator is 0 in the middle of its range, and ±1 at its limits.
 
     Args:
         model: Model of the robot, with gravity.
@@ -119,10 +118,10 @@ class Equilibrium:
         return A, b, np.vstack([torques, thrusts]), np.append(c, -middle / half)
 
     def spares(self, q: Array, room: float) -> bool:
-        """Return whether a nearly even distribution of forces balances the base with all shares below ``1 − room``.
+        """Return whether nearly even forces balance the base with all shares up to ``1 − room``.
 
-        If nearly even forces suffice, the posture can be held, and no linear program is needed.  If they do not
-        suffice, other forces may still hold the posture.
+        If so, the posture can be held, and no linear program is needed.  If not, other forces may still hold the
+        posture.
         """
         key = q.tobytes()
         if self._even is None or self._even[0] != key:
@@ -150,7 +149,7 @@ class Equilibrium:
         return float(np.abs(S @ z + c).max(initial=0.0)) if balanced else np.inf
 
     def distribute(self, q: Array) -> Distribution:
-        """Return the forces that minimize the largest share, or the imbalance if the base cannot be balanced."""
+        """Return the forces that minimize the largest share, or the imbalance if they cannot balance the base."""
         key = q.tobytes()
         if self._latest is None or self._latest[0] != key:
             self._latest = key, self._distribute(q)
@@ -210,7 +209,7 @@ class Equilibrium:
         return self.load.torque(q, np.zeros(self.load.count)).by_force
 
     def _least_share(self, A: Array, b: Array, S: Array, c: Array) -> tuple[Array, float, Array] | None:
-        """Solve ``min s`` with ``A z + b = 0``, ``|S z + c| ≤ s``; return z, 0, multipliers, or ``None``."""
+        """Solve ``min s`` with ``A z + b = 0``, ``|S z + c| ≤ s``; return z, the imbalance 0 and the multipliers."""
         count, one, infinite = self.load.count, np.ones((len(S), 1)), np.full(2 * len(S), np.inf)
         low, high = np.append(self.load.lower, 0.0), np.append(self.load.upper, np.inf)
         # Thrusts have no bounds in this program, because a thrust beyond its limits has a share above one.

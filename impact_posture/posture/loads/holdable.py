@@ -21,21 +21,20 @@ from impact_posture.posture.loads.equilibrium import Equilibrium
 from impact_posture.posture.loads.static_load import StaticLoad
 from impact_posture.system.arrays import Array
 
-# The rows are added to the program if a posture violates them by more than this value, which is half the tolerance of
-# the certificate.
+# Rows are added to the program if a posture violates them by more than this, half the tolerance of the certificate.
 _KEPT = 5e-9
-# If a share of a limit differs from 1 by less than this, its row may be active and have a multiplier.
+# If the share of its limit that an actuator uses is within this of 1, the row may be active and have a multiplier.
 _NEAR = 1e-3
-# Price of a share of a limit in the search for conflicts, lower than the price of a meter.  If a pose cannot be held,
-# the actuators are thus named as the conflict, not the pose.
+# Weight of a violated actuator limit in the search for conflicts (:attr:`Constraint.price`).  It is lower than the
+# weight of a position error, so the search reports the actuators and not the pose.
 _PRICE = 1e-3
 
 
 class Holdable(Constraint):
     """The constraint that forces z exist with which the base is balanced and no actuator exceeds its limits.
 
-    In the program, ``R τ(q, z)`` must be within bounds.  ``c(q)`` has one row for the unbalanced wrench on the base
-    and the row ``share − 1`` for each actuator, at the forces that minimize the largest share.
+    In the nonlinear program, ``R τ(q, z)`` must be within bounds (:class:`Equilibrium`).  ``c(q)`` has one row for
+    the unbalanced wrench on the base, and for each actuator the row ``share − 1``, where 1 is the share at a limit.
 
     Args:
         name: Name of the load, such as ``at rest``.
@@ -45,8 +44,8 @@ class Holdable(Constraint):
     """
 
     price = _PRICE
-    # Starts are not projected onto this constraint.  Most starts end within the limits anyway, and projected starts
-    # would differ less from each other.
+    # Initial postures are not projected onto this constraint, so that they remain diverse.  Most of them end within
+    # the limits anyway.
     projected = False
     by_row = True
 
@@ -80,7 +79,7 @@ class Holdable(Constraint):
         return np.zeros(self.rows) if self._rest.spares(model.q, 0.0) else self.evaluate(model)[0]
 
     def grown(self, model: Numeric, auxiliaries: Array | None = None) -> Self:
-        """Add the rows of the constraint to the program if the posture violates them."""
+        """Return the constraint with its rows in the program if ``model.q`` violates them."""
         if self.active or self.value(model).max() <= _KEPT:
             return self
         return type(self)(self._load, self._rest, self._description, active=True)
@@ -136,7 +135,7 @@ class Holdable(Constraint):
 
 
 class ReachableWrench(ExpressionConstraint):
-    """The rotors can produce the wrench on the base: ``R h(q) = 0`` for all combinations that they cannot produce.
+    """The rotors can produce the wrench on the base: ``R h(q) = 0`` for all combinations they cannot produce.
 
     For example, parallel rotors produce no side force, so the robot has to be level to hold its weight.  ``rows`` is
     the matrix ``R``, which acts on the base wrench in units of the robot's weight, shape (6 − rank of the allocation,

@@ -9,8 +9,8 @@ import numpy as np
 from impact_posture.posture.loads.equilibrium import Equilibrium
 from impact_posture.system.arrays import Array
 
-# Up to this value, an excess of a share above 1 is treated as a rounding error of the solver.  This also applies to
-# an unbalanced wrench in units of the robot's weight.
+# A share above 1 by up to this value is treated as a rounding error of the solver, as is an unbalanced wrench of up
+# to this value in units of the robot's weight.
 _ROUNDING = 1e-6
 
 
@@ -30,7 +30,7 @@ class ActuatorLoad:
 
 @dataclass(frozen=True)
 class HoldingForces:
-    """Forces that hold a posture, chosen to minimize the largest share of an actuator limit.
+    """Forces that hold a posture and minimize the largest :attr:`ActuatorLoad.share`.
 
     Attributes:
         load: Name of the load, such as ``at rest``.
@@ -39,7 +39,7 @@ class HoldingForces:
             robot's weight, moments in units of the weight times 1 m.
         actuators: Load of each actuator with known limits.
         contact_forces: Force of the ground on each foot, world axes, N.
-        other_loads: Holding forces for the other load cases: with the force ``hold_force`` and with payloads.
+        other_loads: Holding forces under the other loads: with the force ``hold_force`` and with payloads.
     """
 
     load: str
@@ -82,7 +82,7 @@ class HoldingForces:
         lines = []
         if self.unbalanced > _ROUNDING:
             lines.append(
-                f"{self.load}, a wrench of {self.unbalanced:.2g} times its weight on its base is not balanced"
+                f"{self.load}, a wrench of {self.unbalanced:.2g} times the robot's weight on the base is not balanced"
             )
         for name, load in sorted(self.actuators.items(), key=lambda item: -item[1].share):
             if load.share > 1 + _ROUNDING and self.unbalanced <= _ROUNDING:

@@ -27,7 +27,7 @@ _EDGES = 4
 # Upper limit of the friction coefficient.  With a larger coefficient, the edges of the friction pyramid would be
 # nearly horizontal and could hardly support weight.
 _MOST_FRICTION = 10.0
-# A singular value of the map from forces to the base wrench is treated as zero below this share of the largest one.
+# Singular values of the map from forces to the base wrench are zero below this fraction of the largest one.
 _RANK = 1e-9
 
 
@@ -45,7 +45,7 @@ class LoadCase:
     unreachable: Array
 
     def constraints(self) -> list[Constraint]:
-        """Return the constraints of this case."""
+        """Return the constraints for this load."""
         rest, holdable = self.equilibrium, Holdable(self.name, self.equilibrium, self.description)
         if not len(self.unreachable):
             return [holdable]
@@ -55,9 +55,9 @@ class LoadCase:
 
 @dataclass(frozen=True, eq=False)
 class LoadCases:
-    """The load cases of a problem, with notes for the user about missing data.
+    """All loads of a problem, with notes for the user about missing data.
 
-    ``unknown`` is the reason why there are no load cases; it is empty if there are load cases.
+    If ``cases`` is empty, ``unknown`` is the reason.
     """
 
     cases: tuple[LoadCase, ...] = ()
@@ -65,7 +65,7 @@ class LoadCases:
     unknown: str = ""
 
     def holding(self, q: Array) -> HoldingForces | None:
-        """Return the forces that hold ``q`` at rest and in the other cases; ``None`` if there are no cases."""
+        """Return the forces that hold ``q`` at rest and under the other loads; ``None`` if there are no loads."""
         if not self.cases:
             return None
         first, *others = [HoldingForces.of(case.name, case.equilibrium, case.unreachable, q) for case in self.cases]
@@ -124,7 +124,7 @@ def load_cases(objective: Objective, q: Array, requirements: Requirements) -> Lo
 
 
 def _reach(load: StaticLoad, q: Array) -> tuple[Array, int]:
-    """Return orthonormal combinations of the base wrench, the reachable ones first, and how many are reachable."""
+    """Return orthonormal combinations of the base wrench as rows, the reachable ones first, and the rank r."""
     vectors, values, _ = np.linalg.svd(load.torque(q, np.zeros(load.count)).by_force[:6])
     return vectors.T, int((values > _RANK * values.max(initial=0.0)).sum())
 

@@ -19,9 +19,9 @@ from impact_posture.system.arrays import Array, null_space
 
 # Only an inequality closer to its bound than this (m, rad) can have a multiplier.
 _ACTIVE = 1e-3
-# A member of a maximum is included if its value is below the maximum by at most this share of f₀.  The tolerance of
-# the solver is also relative to the initial objective f₀.  If the objective decreased by orders of magnitude, this
-# tolerance is large relative to the objective.  The tolerance of complementarity is twice this share.
+# If the objective is a maximum, functions up to this fraction of f₀ below the maximum contribute a gradient.  The
+# tolerance of the solver is also relative to the initial objective f₀, because the objective may decrease by orders
+# of magnitude.  The tolerance of complementarity is twice this fraction.
 _TIED = 5e-8
 # Weight of complementarity relative to stationarity; it equals the ratio of their tolerances.
 _COMPLEMENTARITY = 10.0
@@ -101,8 +101,8 @@ def certify(
     """Certify the posture ``q``.
 
     ``scale`` is the initial objective f₀.  ``auxiliaries`` are the values of the auxiliary unknowns of the
-    constraints at ``q``, by default their guesses.  If the caller passes a model ``numeric``, its state changes to
-    ``q``.
+    constraints at ``q``, by default :meth:`ConstrainedProblem.guess`.  A model ``numeric`` that the caller passes is
+    set to ``q``.
     """
     numeric = (numeric or Numeric(problem.robot.model)).at(q)
     gradients, gaps = objective_gradients(problem, q, scale)
@@ -112,8 +112,7 @@ def certify(
     errors = [c.pose_error(part.value) for c, part in zip(problem.constraints, parts, strict=True)]
     rows, limits = Linearization.joined(parts, problem.robot.nv), _limits(problem, q)
     near: list[_NearBound] = []
-    # Multipliers are computed only near the constraints, because otherwise the computation takes long and cannot
-    # help.
+    # For a posture that violates the constraints, multipliers would take long to compute and could not certify it.
     if rows.violation <= _HOPELESS:
         near = _near_bounds(Linearization.joined([rows, limits], problem.robot.nv))
     jacobian = np.hstack([rows.posture, rows.auxiliary])
@@ -138,10 +137,10 @@ def certify(
 
 
 def objective_gradients(problem: ConstrainedProblem, q: Array, scale: float) -> tuple[Array, Array]:
-    """Return the tangent gradient and the gap of each member of a worst case, shapes (k, nv) and (k,).
+    """Return the gradients, shape (k, nv), and the gaps, shape (k,), of :class:`Subgradients`, divided by the scale.
 
-    The convex combinations of the gradients are the subdifferential of objective/scale plus regularization.  If the
-    objective is smooth at ``q``, k = 1.  A gap is the distance of a member from the maximum, divided by the scale.
+    The gradients include the regularization.  Their convex combinations are the subdifferential of the function that
+    is minimized.  If this function is smooth at ``q``, k = 1.
     """
     members = problem.objective.subgradients(q, _TIED * scale)
     gradients = members.gradients / scale
@@ -153,7 +152,7 @@ def objective_gradients(problem: ConstrainedProblem, q: Array, scale: float) -> 
 
 @dataclass(frozen=True, eq=False)
 class _NearBound:
-    """One side of an active or nearly active inequality: outward gradient, and distance ``slack`` to the limit."""
+    """One side of a nearly active inequality, with its outward gradient and the distance ``slack`` to its limit."""
 
     name: str
     side: str
@@ -192,7 +191,7 @@ def _limits(problem: ConstrainedProblem, q: Array) -> Linearization:
 
 
 def _multipliers(gradients: Array, equalities: Array, near: Sequence[_NearBound]) -> tuple[Array, Array, Array]:
-    """Return weights of the gradients (≥ 0, sum 1), multipliers of the inequalities (≥ 0), and the least residual.
+    """Return weights of ``gradients`` (≥ 0, sum 1), multipliers of ``near`` (≥ 0), and the smallest residual.
 
     Multipliers of equalities can have any sign, so all gradients are projected onto the null space of the equalities.
     The products of multipliers and slacks are added to the residual.  Without these products, a bound that is near

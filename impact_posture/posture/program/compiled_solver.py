@@ -23,8 +23,7 @@ from impact_posture.system.toolchain import find_compiler, require_compiler, run
 CompileMode = Literal["auto", "always", "never"]
 
 # These times are measured with docs/studies/solve.py for talos: compiling 170,000 operations takes about 20 s, and a
-# start of about 25 iterations is then about 30 ms faster.  Whether compiling saves time depends only on their orders
-# of magnitude.
+# run of about 25 iterations is then about 30 ms faster.  Only their orders of magnitude matter for the decision.
 _COMPILE_S_PER_OPERATION = 1.2e-4
 _SAVED_S_PER_OPERATION = 6e-9
 _ITERATIONS = 35
@@ -35,7 +34,7 @@ _OPTIMIZED = 100_000
 
 
 class BuiltSolver(NamedTuple):
-    """``nlpsol``, whether it runs as machine code, and the reason if a compilation failed (otherwise empty)."""
+    """The solver ``nlpsol``, whether it runs as machine code, and why a compilation failed (otherwise empty)."""
 
     solver: ca.Function
     compiled: bool
@@ -53,7 +52,7 @@ def compiled_solver(
     """Build ``nlpsol`` from the expressions ``x``, ``p``, ``f`` and ``g``, compiled or interpreted.
 
     ``options`` are options of IPOPT, ``starts`` is the number of runs that use the same compiled code, and
-    ``derivatives`` are options of ``nlpsol`` with known derivatives.
+    ``derivatives`` are options of ``nlpsol`` that supply derivatives.
 
     Raises:
         InputError: The mode is not one of ``auto``, ``always`` and ``never``.

@@ -73,26 +73,26 @@ class ConstrainedProblem:
         return lower, upper
 
     def guess(self, numeric: Numeric) -> Guess:
-        """Return the initial auxiliaries of all constraints at ``numeric.q``, with their bounds."""
+        """Return initial values and bounds, at ``numeric.q``, of the auxiliary unknowns of all constraints."""
         return Guess.joined([c.guess(numeric) for c in self.constraints if c.unknowns])
 
     def split(self, auxiliaries: Array) -> list[Array]:
-        """Split the vector of all auxiliaries into one part for each constraint."""
+        """Split the vector of all auxiliary unknowns into one vector for each constraint."""
         ends = list(accumulate((c.unknowns for c in self.constraints), initial=0))
         return [auxiliaries[start:stop] for start, stop in pairwise(ends)]
 
     @property
     def grows(self) -> bool:
-        """Whether the program may lack parts, which :meth:`grown` then adds."""
+        """Whether the program may lack rows, which :meth:`grown` then adds."""
         return any(c.grows for c in self.constraints)
 
     def grown(
         self, postures: Sequence[Array], numeric: Numeric | None = None, auxiliaries: Sequence[Array] | None = None
     ) -> ConstrainedProblem:
-        """Add the parts that the program lacks at the postures; return the same problem if no parts are missing.
+        """Return the problem with the rows that the program lacks at the postures, or ``self`` if none are missing.
 
-        If the postures are final postures of runs, ``auxiliaries`` are the final auxiliaries of these runs, shape
-        (k,) each.  If the caller passes a model ``numeric``, its state changes to the last posture.
+        If the postures are final postures of runs, ``auxiliaries`` are the final auxiliary unknowns of these runs,
+        shape (k,) each.  A model ``numeric`` that the caller passes is set to the last posture.
         """
         constraints, numeric = list(self.constraints), numeric or Numeric(self.robot.model)
         for index, q in enumerate(postures):
@@ -108,7 +108,7 @@ class ConstrainedProblem:
         return replace(self, constraints=tuple(constraints), rows=rows)
 
     def slack(self, auxiliaries: Array) -> float:
-        """Return the largest slack of a constraint, m, from the auxiliaries at the end of a run."""
+        """Return the largest slack of a constraint, m, for the auxiliary unknowns at the end of a run."""
         ends = self.split(auxiliaries)
         return max((c.slack(end) for c, end in zip(self.constraints, ends, strict=True)), default=0.0)
 
@@ -126,7 +126,7 @@ class ConstrainedProblem:
 
 
 def rank(jacobian: Array) -> int:
-    """Return the rank of a constraint Jacobian, with the tolerance that all computations of the redundancy use."""
+    """Return the rank of a constraint Jacobian, with :data:`RANK_TOLERANCE`."""
     return int(np.linalg.matrix_rank(jacobian, tol=RANK_TOLERANCE)) if jacobian.size else 0
 
 

@@ -19,8 +19,8 @@ from impact_posture.posture.program.program import Program, parameters
 from impact_posture.posture.program.program_rows import ProgramRows
 from impact_posture.system.arrays import Array
 
-# Price of a meter of slack in units of the initial objective.  The price must exceed the decrease of the objective
-# per meter of slack.  With the price 2, the solutions still had slack.
+# Penalty per meter of :attr:`LiftedRows.slack`, in units of the initial objective.  It must exceed the decrease of
+# the objective per meter of slack.  With a penalty of 2, the solutions still had slack.
 SLACK_PRICE = 50.0
 # Counter for the numbers of the programs in this process.
 _NUMBERS = count()
@@ -28,13 +28,13 @@ _NUMBERS = count()
 
 @dataclass(frozen=True, eq=False)
 class WarmStart:
-    """Final values of a run; a run of the same program with another target can continue from these values.
+    """Final values of a solver run, from which a run of the same program with another target can continue.
 
     Attributes:
         x: All unknowns, shape (n,), between ``lower`` and ``upper``.
         of_bounds: Multipliers of the bounds ``lower`` and ``upper``, shape (n,).
         of_rows: Multipliers of the rows, shape (m,).
-        scale: Divisor of the objective in the run that gave these multipliers.
+        scale: Divisor of the objective to which the multipliers belong.
     """
 
     program: int
@@ -48,7 +48,7 @@ class WarmStart:
 
 @dataclass(frozen=True)
 class SolveRecord:
-    """Result of one run of the solver: posture, status and iterations of IPOPT, and wall time of the call.
+    """Result of a solver run: posture, status and iterations of IPOPT, and wall time of the call.
 
     ``auxiliaries`` are the final values of the auxiliary unknowns of the constraints, shape (k,).  ``minimized`` is
     the final value of the function that the solver minimizes, in units of the scale.  ``end`` contains all values
@@ -75,9 +75,9 @@ class PostureNLP:
 
     Attributes:
         build_time_s: Time to build and compile the program.
-        compiled: Whether its functions run as machine code.
+        compiled: Whether the functions of the solver run as machine code.
         compiler_fault: Reason why a compilation failed; empty if no compilation failed.
-        number: Number of the program; the program with another target has the same number.
+        number: Number of the program; it stays the same when only the target changes.
     """
 
     problem: ConstrainedProblem
@@ -106,7 +106,7 @@ class PostureNLP:
         return nlp
 
     def grown(self, problem: ConstrainedProblem, *, compile: CompileMode = "auto") -> PostureNLP:
-        """Build the program of ``problem``, the problem of this program with additional parts."""
+        """Build the program of ``problem``, which is the problem of this program with additional rows."""
         return build_nlp(problem, compile=compile, program=self.program)
 
     def solve(
@@ -121,9 +121,8 @@ class PostureNLP:
         """Solve from the configuration ``start``, shape (nq,).
 
         ``scale`` divides the objective, by default its value at ``start``.  ``attempt`` is the index of the initial
-        guess for the auxiliaries of the objective, and ``price`` the price of a meter of slack.  ``warm`` contains
-        the final values of a run that ended at ``start`` with another target.  If ``warm`` belongs to another
-        program, it is ignored.
+        guess for the unknowns that the objective adds.  ``price`` is the penalty per meter of slack.  ``warm`` has
+        the final values of a run that ended at ``start`` with another target; values of another program are ignored.
         """
         scale = scale or self.problem.objective.value(start)
         if warm is None or warm.program != self.number:
@@ -140,7 +139,7 @@ class PostureNLP:
         """Return initial values for a run without multipliers."""
         problem, unclipped = self.problem, self.chart.to_x(start)
         x = np.clip(unclipped, problem.lower, problem.upper)
-        # Use ``start`` itself if possible, because its impact quantities are usually cached.
+        # Use ``start`` itself if possible, because the impact quantities at ``start`` are usually cached.
         q = start if np.array_equal(x, unclipped) else self.chart.to_q(x)
         impact, rows = problem.objective.guess(q, scale, attempt), problem.guess(self.program.numeric.at(q))
         return WarmStart(
@@ -185,8 +184,7 @@ class PostureNLP:
     def _row_bounds(self) -> dict[str, Array]:
         norms = np.zeros(len(self.chart.quaternion_slices()))
         lower, upper = (np.concatenate([norms, bounds]) for bounds in self.problem.row_bounds)
-        # The remaining rows belong to the objective: first equations, then inequalities that bound the objective from
-        # below.
+        # The remaining rows belong to the objective: first equations, then inequalities.
         zeros = np.zeros(self.solver.size1_in("lbg") - len(lower))
         below = np.where(np.arange(zeros.size) < zeros.size - self.program.bounded, 0.0, -np.inf)
         return {"lbg": np.concatenate([lower, below]), "ubg": np.concatenate([upper, zeros])}
@@ -202,8 +200,8 @@ def build_nlp(
 ) -> PostureNLP:
     """Build the program for ``starts`` runs; this number decides whether compiling saves time.
 
-    ``program`` contains the expressions of the same problem with fewer parts; they are reused.  ``rows`` are the rows
-    of the constraints, if they are already built.
+    ``program`` has the expressions of the same problem with fewer rows, which are reused.  ``rows`` are the rows of
+    the constraints, if they are already built.
 
     Raises:
         CompilerError, OutputError: For the same reasons as in
@@ -212,8 +210,7 @@ def build_nlp(
     began = time.perf_counter()
     program = program or Program(problem, rows)
     symbols, derivatives = program.symbols(problem)
-    # A program to which parts are added is soon replaced, so it is compiled only if compiling saves time for a single
-    # run.
+    # A program that can grow is soon replaced, so it is compiled only if this saves time for a single run.
     built = compiled_solver(problem, symbols, _options(problem), compile, 1 if problem.grows else starts, derivatives)
     took = time.perf_counter() - began
     return PostureNLP(problem, program, built.solver, took, built.compiled, built.fault)

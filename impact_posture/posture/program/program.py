@@ -1,13 +1,13 @@
 """The expressions of the nonlinear program.
 
-In the lifted formulation, IPOPT solves the linear equations of the impact::
+In the lifted formulation, the linear equations of the impact are constraints of the program::
 
-    min over x, a, f, s   aᵀWa        (or λ/2)
+    min over x, a, f, s   aᵀWa        (or λ/2 for ``energy``)
     subject to            M(q)a − J_sᵀf − Jᵀs = 0,  J_s a + εf = 0,  equations of s and n,
                           c(q) within bounds,  |quaternions| = 1,  limits,
 
-In this formulation, every function is linear or quadratic in the auxiliaries, and the exact Hessian stays small
-(``docs/studies/formulations.py`` compares both forms).  An inner maximum adds unknowns and rows
+In this formulation, every function is linear or quadratic in a, f and s, and the exact Hessian stays small
+(``docs/studies/formulations.py`` compares both forms).  A worst case adds unknowns and rows
 (:mod:`impact_posture.impact.worst_case.model_set`).
 """
 
@@ -27,9 +27,9 @@ from impact_posture.system.arrays import Array
 
 
 class Program:
-    """The expressions of a program; most of them stay the same when parts are added to the problem.
+    """Expressions of the nonlinear program; most of them are reused when rows are added to the problem.
 
-    ``rows`` are the rows of the constraints; all programs of the same problem share them.
+    ``rows`` are the rows of the constraints, which all programs of a problem share.
 
     Attributes:
         numeric: The Pinocchio model, which all runs share.
@@ -47,7 +47,7 @@ class Program:
         self.parameters = ca.vertcat(impact, scale, weight, self._price, rows.reference, *rows.parameters)
 
     def branch(self) -> Program:
-        """Return a copy to which parts can be added without changing this program."""
+        """Return a copy to which rows can be added without changing this program."""
         branch = copy(self)
         branch.rows = self.rows.branch()
         return branch
@@ -55,8 +55,8 @@ class Program:
     def symbols(self, problem: ConstrainedProblem) -> tuple[dict[str, ca.SX], dict[str, ca.Function]]:
         """Return the expressions of a problem and options of ``nlpsol``.
 
-        The expressions are ``x`` (unknowns), ``p`` (parameters), ``f`` and ``g``.  If parts can be added to the
-        problem, the options contain its derivatives; otherwise they are empty.
+        The expressions are ``x`` (unknowns), ``p`` (parameters), ``f`` and ``g``.  If rows can be added to the
+        problem, the options supply its derivatives; otherwise they are empty.
         """
         rows, objective = self.rows.lift(problem), self.lifted
         x = ca.vertcat(self.rows.x, objective.variables, rows.variables)
@@ -74,7 +74,7 @@ class Program:
 
     @cached_property
     def fixed(self) -> Derivatives:
-        """Derivatives of the objective value, quaternion norms and rows of the objective, which never change."""
+        """Derivatives of objective value, quaternion norms and objective rows, unchanged when constraints grow."""
         objective, nx, norms = self.lifted, self.chart.nx, self.rows.norms
         rows = ca.vertcat(self.value, norms, objective.rest, objective.inequalities)
         derivatives = Derivatives.of(rows, ca.vertcat(self.rows.x, objective.variables))

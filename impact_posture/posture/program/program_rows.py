@@ -56,7 +56,7 @@ class Derivatives:
 
 
 class ProgramRows:
-    """Lifted constraints of a problem, with all parts added so far; all programs of the problem share them.
+    """Rows of the constraints of a problem, with all rows added so far; all programs of the problem share them.
 
     Attributes:
         x: Chart coordinates, shape (nx, 1).
@@ -130,7 +130,7 @@ class ProgramRows:
         return Derivatives(multipliers[new_rows], J[new_rows, new_columns], H[new_columns, new_columns])
 
     def _of_sides(self, piece: LiftedRows) -> Derivatives:
-        """Return the cached derivatives of the sides of a piece; a piece with other sides is another object."""
+        """Return the cached derivatives of :attr:`LiftedRows.sides` of a piece."""
         if piece not in self._sides:
             self._sides[piece] = Derivatives.of(piece.sides, piece.variables)
         return self._sides[piece]
@@ -145,7 +145,7 @@ class ProgramRows:
 
 
 def _with_sides(rows: Derivatives, sides: list[Derivatives], nx: int) -> Derivatives:
-    """Add the derivatives of sides; each side depends only on the auxiliaries of one piece."""
+    """Add the derivatives of :attr:`LiftedRows.sides`, which depend only on the auxiliary unknowns of one piece."""
     jacobian = ca.diagcat(*[part.jacobian for part in sides])
     return Derivatives(
         ca.vertcat(rows.multipliers, *[part.multipliers for part in sides]),
@@ -155,7 +155,7 @@ def _with_sides(rows: Derivatives, sides: list[Derivatives], nx: int) -> Derivat
 
 
 def _stacked(parts: list[Derivatives], nx: int) -> tuple[ca.SX, ca.SX]:
-    """Return the joint Jacobian and Hessian of parts that share the unknowns x but no auxiliaries."""
+    """Return the joint Jacobian and Hessian of parts that share the unknowns x but no auxiliary unknowns."""
     J = ca.horzcat(ca.vertcat(*[p.jacobian[:, :nx] for p in parts]), ca.diagcat(*[p.jacobian[:, nx:] for p in parts]))
     both = ca.horzcat(*[p.hessian[:nx, nx:] for p in parts])
     H = ca.vertcat(
@@ -166,5 +166,5 @@ def _stacked(parts: list[Derivatives], nx: int) -> tuple[ca.SX, ca.SX]:
 
 
 def joined(first: Derivatives, second: Derivatives, nx: int) -> Derivatives:
-    """Join the derivatives of two sets of rows that share the unknowns x but no auxiliaries."""
+    """Join the derivatives of two sets of rows that share the unknowns x but no auxiliary unknowns."""
     return Derivatives(ca.vertcat(first.multipliers, second.multipliers), *_stacked([first, second], nx))
