@@ -29,8 +29,8 @@ class FittedShapes:
     Attributes:
         bodies: Swept hulls that contain all shapes.
         pairs: Pairs of bodies that must not touch, as indices into ``bodies``, shape (k, 2).
-        always_touching: Names of shapes that touch at the default posture and at most other postures.  These shapes
-            overlap by design, so their contact is allowed.
+        always_touching: Names of shapes that touch at the default posture and at more than half of random postures.
+            These shapes overlap by design, so their contact is allowed.
         joint_planes: Bounds on joints for nested bodies (:func:`nested_pairs`), which ``pairs`` leaves out.
         hulls_touching: Names of nested bodies without such bounds.  Only :class:`MeshCheck` detects their collisions.
         warnings: Warnings about shapes, one line each.

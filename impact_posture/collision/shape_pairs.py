@@ -1,4 +1,4 @@
-"""Pairs of shapes that must not touch, and pairs that touch at most postures."""
+"""Pairs of shapes that must not touch, and pairs that touch at more than half of random postures."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def pairs_of(apart: NDArray[np.bool_]) -> list[Pair]:
 
 
 def mostly_touching(robot: Robot, shapes: Sequence[pin.GeometryObject], pairs: list[Pair]) -> list[Pair]:
-    """Return the pairs of shapes that touch at the default posture and at most of 1,000 random postures.
+    """Return the pairs of shapes that touch at the default and at more than half of 1,000 random postures.
 
     Such shapes overlap by design, for example the covers of a wrist.
     """
@@ -63,8 +63,8 @@ def nested_pairs(
 ) -> list[Pair]:
     """Return the pairs of nested bodies, for example a shaft in a fork.
 
-    At most of the postures where the shapes of nested bodies do not touch, their hulls overlap.  Keeping these hulls
-    apart would forbid most postures.  ``touch`` tells whether the shapes touch at the placements in the data.
+    Their hulls overlap at more than half of the postures where their shapes do not touch.  Keeping the hulls apart
+    would forbid most postures.  ``touch`` tells whether the shapes touch at the placements in the data.
     """
     data = robot.model.createData()
     apart, forbidden = np.zeros((2, len(pairs)), dtype=int)
