@@ -79,7 +79,7 @@ class CompiledController:
 
         Args:
             path: The folder of the export, or its ``<prefix>.json``.
-            robot: The robot for which the export must have been made; ``None`` skips this check.
+            robot: The robot that the manifest must match; with ``None``, the robot is not checked.
 
         Raises:
             SpecError: The export is missing or broken.
@@ -183,7 +183,7 @@ class CompiledController:
     def set_target(
         self, task: str, target: pin.SE3 | ArrayLike, velocity: ArrayLike = 0.0, acceleration: ArrayLike = 0.0
     ) -> None:
-        """Set the target of the task named ``task``, in the form that the task's class in ``tsid`` uses.
+        """Set the target of the task named ``task``.  The form of the target is the same as in ``tsid``.
 
         Raises:
             InputError: The controller has no such task.
@@ -248,10 +248,7 @@ class CompiledController:
 
     @property
     def flow_failures(self) -> int:
-        """Number of steps since the reset for which the solver of the reference flow failed.
-
-        After such a step, the flow rests.
-        """
+        """Number of steps since the reset for which the solver of the reference flow failed."""
         self._call("last_report", ctypes.byref(self._report))
         return int(self._report.flow_failures)
 
@@ -264,8 +261,8 @@ class CompiledController:
                 time is unknown.
 
         Raises:
-            InputError: This phase cannot follow the present phase, or ``t`` is before the time of a waiting phase.
-                Also raised if ``t_impact`` is given and is not finite, or if the controller has no flow.
+            InputError: This phase cannot follow the present phase, or ``t`` is before the time of a waiting phase, or
+                ``t_impact`` is not finite, or ``t_impact`` is given to a controller without a flow.
         """
         if t_impact is None:
             self._enter("brace", t)
@@ -276,7 +273,7 @@ class CompiledController:
             self._enter("brace_before", t, t_impact)
 
     def contact(self, t: float = -math.inf) -> None:
-        """Make the reached posture the target during the impact, or keep the term on if it is live.
+        """Hold the reached posture during the impact, or keep the impact-robust term on if its activation is live.
 
         ``t`` has the same meaning as in :meth:`brace`.
         """

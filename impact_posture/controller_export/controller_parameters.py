@@ -24,8 +24,8 @@ class Field(NamedTuple):
 
     Attributes:
         name: Name in the C structure.
-        rule: Rule for the values that ``init`` accepts.  ``limit`` and ``positive`` permit infinity, and a ``share``
-            is at most 1.
+        rule: Rule for values that the C function ``init`` accepts.  Only ``limit`` and ``positive`` permit infinity.
+            A ``share`` is at most 1.
         text: Meaning and unit, for the header.
         value: Values in the exported formulation, as a flat array.
     """

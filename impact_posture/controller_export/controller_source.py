@@ -53,7 +53,7 @@ class GeneratedCode:
     """C code that computes the quantities in ``ip_model``, or an objective.
 
     Attributes:
-        constants: C text of tables of numbers.
+        constants: C definitions of constant tables.
         blocks: C functions that each compute a part of the quantities.
         angles: Indices of the entries of ``q`` whose sine and cosine are used.
         work: Length of the work array.
@@ -102,10 +102,7 @@ def dynamics_code(
 
 @lru_cache(maxsize=2)
 def objective_code(objective: WorstCaseObjective) -> GeneratedCode:
-    """Generate an objective and its gradient.
-
-    Like the shared :func:`dynamics_code`, this code reads the numbers of the model at run time.
-    """
+    """Generate an objective and its gradient, as code that reads the numbers of the model at run time."""
     q, numbers = ca.SX.sym("q", objective.robot.nq), ModelParameters(objective.robot.model)
     kernel = ImpactKernel(objective.case, q, ca.SX(ca.DM(objective.contact.normal)), numbers)
     targets = dict(zip(("value[{}]", "gradient[{}]"), objective.worst_case.expressions(kernel), strict=True))
@@ -144,10 +141,10 @@ def render(
 ) -> dict[str, str]:
     """Return file name → text of the header and the sources, whose C names begin with ``prefix``.
 
-    The library contains the ``identity`` of the manifest.  ``metric`` is the prefix of the gradient's C names;
-    ``None`` means that there is no gradient.  If ``objective`` is given, its :func:`objective_code` is the gradient;
-    otherwise, the gradient is exported separately.  With ``shared``, the last parameter is ``numbers``, in which
-    robots with the same code may differ.
+    The library contains the ``identity`` of the manifest.  C names of the gradient begin with ``metric``; ``None``
+    means no gradient.  If ``objective`` is given, the files contain its :func:`objective_code`; otherwise, the caller
+    exports the gradient.  With ``shared``, the last parameter is ``numbers``, in which robots with the same code may
+    differ.
     """
     points, robot = tuple((p.frame, p.offset, p in s.turning) for p in s.points), s.robot
     code = dynamics_code(robot, points, shared=shared)

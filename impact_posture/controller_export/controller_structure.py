@@ -154,14 +154,14 @@ def structure_of(robot: Robot, formulation: TaskFormulation) -> Structure:
         "inverse": actuators.inverse,
         "blind": actuators.blind if rotors else np.eye(actuators.base),
         "spare": actuators.spare,
-        # For an aligned frame: its axis and the two directions across the axis.
+        # The axis of an aligned frame, and two directions orthogonal to the axis.
         "task_axis": [[t._axis, *t._across] if isinstance(t, FrameAligned) else np.zeros((3, 3)) for t in tasks],
     }
     if sizes["FLOW"] and robot.floating:
         doubles["upright"] = robot.upright
     arrays: dict[str, NDArray[Any]] = {name: np.array(v, dtype=np.int64) for name, v in tables.items()}
     arrays |= {name: np.array(values, dtype=float).ravel() for name, values in doubles.items()}
-    # The bounds on joints are either simple bounds, which come first, or they are the last rows.
+    # The acceleration bounds of joints come first if they bound variables, and last if they are rows.
     bounded, rows = assembly.names[actuators.base : nv], assembly.names[assembly.qp.n :]
     names = (*(bounded if sizes["SIMPLE"] else ()), *rows, *(bounded if bounds else ()))
     levels = tuple(name for name, _ in assembly.levels)
@@ -173,8 +173,8 @@ def _add_flow(
 ) -> None:
     """Add sizes and tables of a reference flow.
 
-    ``HELD`` is the number of rows that the flow does not move: contacts, tasks and joints.  ``flow_led`` contains the
-    number, from 1, of each task that the flow moves, and zero for each other task.
+    ``HELD`` is the number of rows of the constraints on the flow: contacts, tasks and held joints.  ``flow_led``
+    numbers the tasks that the flow moves, from 1; all other tasks have the number zero.
     """
     posture = formulation.posture
     flow = posture if isinstance(posture, ReferenceFlowPosture) else None
@@ -203,7 +203,7 @@ def _add_flow(
 
 
 def _is_diagonal_in_momentum(robot: Robot, formulation: TaskFormulation) -> bool:
-    """Return whether the cost consists only of center of mass, base orientation and the joints of a posture task."""
+    """Return whether the cost contains only center of mass, base orientation and a posture task without the base."""
     tasks, posture = formulation.weighted, formulation.posture
     kinds = {type(task) for task in tasks}
     return (

@@ -21,7 +21,7 @@ from impact_posture.system.libraries import building, cache_folder, is_cached
 VERSION = "0.11.0"
 SOURCES = ("auxiliary.c", "daqp.c", "factorization.c")
 _HEADERS = ("auxiliary.h", "constants.h", "daqp.h", "factorization.h", "types.h")
-# SHA-256 of the source distribution, which pip checks, and of the contents of the needed files in the order of FILES.
+# SHA-256 of the source distribution, which pip checks, and of the files in FILES, joined in this order.
 _ARCHIVE_SHA256 = "2f27baf18d2acca14186498e651b34e0bed455627e777d3fd8ba655e7e40f920"
 _CONTENT_SHA256 = "7cce7844f7cf515e8c1fe9208e3996b0569c954ef641ad5b3478657ee23a6e9d"
 # Path of each file in the distribution.  In an exported controller, all files are in one folder.
@@ -32,8 +32,8 @@ FILES = {
 }
 # Largest permitted size of a file, bytes.
 _LARGEST = 1 << 20
-# Small build backend that gives pip the metadata that pip always requires.  Without this backend, pip would install
-# the real backend and run the code of the distribution, which takes minutes.
+# Build backend that only returns the metadata that pip requires.  The real backend would run code of the
+# distribution, which takes minutes.
 _BACKEND = f"""
 import pathlib
 def prepare_metadata_for_build_wheel(folder, settings=None):
@@ -72,7 +72,7 @@ def daqp_sources(folder: Path | None = None) -> dict[str, bytes]:
 def renamed(sources: dict[str, bytes], prefix: str) -> dict[str, str]:
     """Return a header and a source file that add ``prefix`` to the names of all DAQP functions.
 
-    Without the prefix, names would collide if a program contains two controllers or its own DAQP.
+    Without the prefix, names collide in a program that contains two controllers or another DAQP.
     """
     headers = "".join(sources[name].decode() for name in _HEADERS)
     names = re.findall(r"^(?:void|int|c_float) (\w+)\(", headers, re.MULTILINE)

@@ -34,14 +34,13 @@ def default_formulation(
 ) -> TaskFormulation:
     """Return the formulation for a kind of robot, with default gains.
 
-    For ``aerial`` and ``arm``, the task of the end effector constrains the same directions as ``optimize`` does by
-    default, so that the redundancy is the same.
+    For ``aerial`` and ``arm``, the end effector task constrains the same directions as ``optimize`` by default.
 
     Args:
         robot: The robot.
         kind: ``aerial``, ``legged`` or ``arm``.
         objective: The objective whose gradient the posture task follows; ``None`` for a nominal posture task.
-        flow: If true, a reference flow follows the gradient; otherwise, the impact-robust term follows it.
+        flow: If true, the posture task has a reference flow; otherwise, the impact-robust term.
 
     Raises:
         InputError: The robot is not of this kind, or its data do not name an end effector.
@@ -66,9 +65,8 @@ def _end_effector(robot: Robot, objective: WorstCaseObjective | None) -> EndEffe
     """Return the task of the end effector, or ``None`` if no frame is known.
 
     The end effector is the frame of the impact.  Without an impact, or if the pose mode of this frame is ``free``,
-    the end effector is the default contact frame.  The task constrains the directions of the frame's pose mode.
-    ``aligned`` uses the normal at the default posture.  The task constrains the whole pose for ``free``, and for
-    ``aligned`` without an impact.
+    the end effector is the default contact frame.  The pose mode of the frame determines the task
+    (:func:`~impact_posture.tsid.tasks.frame_tasks.pose_task`).  ``aligned`` uses the normal at the default posture.
     """
     frame, offset = robot.spec.contact.frame, robot.spec.contact.offset
     aligned = None
@@ -85,7 +83,7 @@ def _end_effector(robot: Robot, objective: WorstCaseObjective | None) -> EndEffe
 
 
 def _hint(robot: Robot, kind: ControllerKind, error: InputError) -> str:
-    """Return a hint that names the kind of the robot, or the data that this kind requires."""
+    """Return a hint that names the correct controller kind of the robot, or data that the robot lacks."""
     if robot.floating and not robot.spec.supports and robot.spec.propulsion is None:
         return "name [propulsion] or [[supports]] in robot.toml"
     fits = "legged" if robot.spec.supports else "aerial" if robot.spec.propulsion else "arm"

@@ -81,9 +81,9 @@ def export_controller(
     generated: Sequence[str] = (),
     shared: bool = False,
 ) -> ControllerExport:
-    """Write the controller of a formulation as C99 code to a folder.  If this fails, the folder is not changed.
+    """Write the controller of a formulation as C99 code to a folder, completely or not at all.
 
-    The structure of the formulation is fixed in the code.  Gains, weights, limits and targets are parameters that a
+    The tasks, contacts and sizes are fixed in the code.  Gains, weights, limits and targets are parameters that a
     program can set; their defaults are the values of the formulation.
 
     Args:
@@ -97,8 +97,8 @@ def export_controller(
         build: Also build ``lib<prefix>.so`` in the folder, if there is a compiler.
         force: Replace an earlier export.
         generated: Additional compiler flags for the sources that are generated from the model.
-        shared: Make armature and joint placements a parameter, ``numbers``.  Robots that differ only in these numbers
-            then have the same code.  The gradient is then a part of this code.
+        shared: Make armature and joint placements a parameter, ``numbers``, so that robots that differ only in these
+            numbers share the code.  The code then contains the gradient.
 
     Raises:
         InputError: A task or joint has no C code, or the gradient or the sources of DAQP are missing.

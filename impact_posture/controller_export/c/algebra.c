@@ -1,9 +1,9 @@
 /* Rotations, the configuration manifold, and small dense factorizations.  Matrices are row-major. */
 
-/* Families of joints, as in ip_joint_family. */
+/* Families of joints, the values of ip_joint_family. */
 enum { IP_DIRECT, IP_CONTINUOUS, IP_FREE_FLYER, IP_SPHERICAL };
 
-/* Like fmin and fmax if b is not NaN, but without a function call. */
+/* fmin and fmax without a function call; b must not be NaN. */
 static double ip_least(double a, double b)
 {
   return a < b ? a : b;

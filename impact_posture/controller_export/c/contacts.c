@@ -1,4 +1,4 @@
-/* Contacts with the ground: desired accelerations, places, and friction cones. */
+/* Contacts with the ground: desired accelerations, target poses, and friction cones. */
 
 /* Least length of the part of a heading that is orthogonal to the normal. */
 #define IP_ACROSS 1e-6
@@ -30,7 +30,7 @@ static void ip_contact_rows(ip_context *c)
   }
 }
 
-/* Return whether a sole stands on its edge: its heading is parallel to the normal of the ground. */
+/* Return whether a sole stands on its edge, that is, whether its x axis is parallel to the normal of the ground. */
 static int ip_on_edge(const ip_context *c)
 {
   int k;
@@ -45,7 +45,7 @@ static int ip_on_edge(const ip_context *c)
   return 0;
 }
 
-/* Make the present places of the contacts their targets, and write the rows of their friction cones in world axes.
+/* Set the targets of the contacts to their present poses, and write the rows of the friction cones in world axes.
  * support_contact.py explains the formulas.  A row has nonzero entries only at the forces of its contact. */
 static void ip_hold_contacts(ip_context *c)
 {

@@ -1,8 +1,8 @@
 /* Eigenvalues of a symmetric matrix: Householder's tridiagonal form, then QR steps with Wilkinson's shift (Golub and
  * Van Loan, Matrix Computations, sections 8.3.1 and 8.3.3). */
 
-/* Replace the symmetric n x n matrix A by V A V', which is tridiagonal; only the diagonal and the entries above are
- * written. */
+/* Replace the symmetric n x n matrix A by the tridiagonal matrix V A V'.  Only the diagonal and the entries above the
+ * diagonal are written. */
 static void ip_tridiagonal(double *A, double *V, int n)
 {
   double p[IP_LARGEST], beta[IP_LARGEST], e[IP_LARGEST];
@@ -41,8 +41,7 @@ static void ip_tridiagonal(double *A, double *V, int n)
   }
 }
 
-/* Do one QR step on the rows low to high of the tridiagonal matrix with the diagonal d and the entries e beside it.
- * */
+/* Do one QR step on the rows low to high of the tridiagonal matrix with diagonal d and off-diagonal e. */
 static void ip_qr_step(double *d, double *e, double *V, int n, int low, int high)
 {
   const double half = 0.5 * (d[high - 1] - d[high]), t = e[high - 1];
@@ -67,8 +66,7 @@ static void ip_qr_step(double *d, double *e, double *V, int n, int low, int high
   }
 }
 
-/* Diagonalize a tridiagonal matrix by at most about `rotations` rotations; the diagonal approaches the eigenvalues.
- * */
+/* Diagonalize a tridiagonal matrix by at most about `rotations` rotations. */
 static void ip_diagonalize(double *A, double *V, int n, int rotations)
 {
   double e[IP_LARGEST], d[IP_LARGEST];

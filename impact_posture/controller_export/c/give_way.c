@@ -1,14 +1,14 @@
 /* Relaxed answer for a tick whose strict levels cannot hold (relaxation.h). */
 
-/* Number of rows of the program, without the bounds on joints. */
+/* Number of rows of the QP, without the rows that bound joint accelerations. */
 #define IP_OTHERS (IP_GENERAL - (IP_DENSE ? IP_BOUNDED : 0))
-/* A row whose error is below this share of its terms counts as satisfied. */
+/* A row counts as satisfied if its error is below this share of the sum of its absolute terms. */
 #define IP_OFF 1e-6
-/* Unit of the force on a contact, relative to the mass of the robot, if the unit of accelerations is 1.  Of the
- * values from 0.03 to 10, this value led to the fewest iterations for pushed robots. */
+/* Unit of contact forces, divided by the mass of the robot times 1 m/s2.  Of the values from 0.03 to 10, this value
+ * led to the fewest iterations for pushed robots. */
 #define IP_FORCE_UNIT 0.1
 
-/* Write the largest violation of a bound on a joint, then the norm of the error of each level. */
+/* Write the largest violation of an acceleration bound, then the error norm of each level, to c->gave. */
 static void ip_list_gave_way(ip_context *c, const double *lower, const double *upper)
 {
   double most = 0.0, size = 1.0;
@@ -20,7 +20,7 @@ static void ip_list_gave_way(ip_context *c, const double *lower, const double *u
   }
   c->gave[0] = most > IP_OFF * size ? most : 0.0;
   for (k = 0; k < IP_LEVELS; ++k) {
-    /* First the rows that are equations, then the rows that lack rank. */
+    /* Index 0 is for rows that are equations, index 1 for dependent rows. */
     double square[2] = {0}, worst[2] = {0}, sizes[2] = {1.0, 1.0};
     for (i = r; i < r + ip_level_rows[k]; ++i) {
       const int lacks = isinf(c->low[IP_SIMPLE + i]) ? 1 : 0;

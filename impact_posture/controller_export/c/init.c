@@ -2,7 +2,7 @@
 
 const unsigned long ip_context_bytes = (unsigned long)sizeof(ip_context);
 
-/* Return whether a number satisfies a rule of ip_rules and is not NaN. */
+/* Return whether a number satisfies the rule (a value of ip_rules) and is not NaN. */
 static int ip_holds(int rule, double x)
 {
   return !isnan(x) && (!(rule & IP_IS_FINITE) || isfinite(x)) && (!(rule & IP_NOT_NEGATIVE) || x >= 0.0)
@@ -36,7 +36,7 @@ int ip_init(ip_context *c, const ip_params *p)
     }
   }
   for (i = 0; IP_MOMENTUM && i < 3; ++i) {
-    /* In momentum coordinates, the posture task must have no weight on the base. */
+    /* With IP_MOMENTUM (qp.c), the posture task must have no weight on the base. */
     if (p->posture_weight[i] != 0.0) {
       return IP_AT_POSTURE_WEIGHT;
     }

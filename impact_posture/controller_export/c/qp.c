@@ -54,13 +54,13 @@ static void ip_whiten(const ip_context *c, const double *row, double *restrict o
 #endif
 }
 
-/* Normalize a row of M, and set its bounds. */
+/* Scale a row of M to the length one, and set its bounds. */
 static void ip_finish(ip_context *c, int r, double lower, double upper)
 {
   double *row = c->M[r], length = ip_dot(row, row, IP_VARIABLES), scale;
   const double shift = ip_dot(row, c->center, IP_NV);
   const int at = IP_SIMPLE + r;
-  /* The sum is finite as long as all numbers are finite. */
+  /* The sum shows later whether all numbers were finite. */
   c->sum += length + shift + (isnan(lower) || isnan(upper) ? NAN : 0.0);
   scale = length > IP_NOTHING * IP_NOTHING ? 1.0 / sqrt(length) : 1.0;
   ip_scaled(row, scale, row, IP_VARIABLES);
@@ -71,8 +71,8 @@ static void ip_finish(ip_context *c, int r, double lower, double upper)
   c->lower[at] = (lower - shift) * scale;
 }
 
-/* Add the cost of weighted tasks, soft contacts and the posture to the upper triangle of H, with rows of `stride`
- * numbers, and to g, where -g is its linear part. */
+/* Add the cost of weighted tasks, soft contacts and the posture to H and g.  Only the upper triangle of H is written;
+ * its rows have `stride` numbers.  The linear term of the cost is -g. */
 static void ip_cost(const ip_context *c, double *H, int stride, double *g)
 {
   int i, r;
@@ -135,7 +135,7 @@ static void ip_factorize(ip_context *c)
 #endif
 }
 
-/* Write the row of s'(M v + h - J'f), where s has `count` entries from `first` on, and return s'h. */
+/* Write the row of s'(M v + h - J'f), and return s'h.  s has `count` nonzero entries, from the entry `first` on. */
 static double ip_force_row(const ip_context *c, const double *s, int first, int count, double *restrict row)
 {
   double bias = s[0] * c->free_force[first];
@@ -238,7 +238,7 @@ static void ip_cool(ip_context *c)
   }
 }
 
-/* Read the weights, and transform the rows of the friction cones. */
+/* Read the weights, and transform the rows of the friction cones to rows of M. */
 static void ip_begin_qp(ip_context *c)
 {
   int i, k;

@@ -1,8 +1,7 @@
 /* Strict levels of any rank, as in LevelRank (level_rank.py): dependent rows are removed from the program, and nearly
  * dependent rows are damped. */
 
-/* Smallest singular value without damping, divided by the length of the level's longest row; share of this value
- * below which a direction is removed; least 1 - alpha. */
+/* As in level_rank.py: IP_SINGULAR is SINGULAR, IP_DROPPED is _NOTHING, and IP_LEAST is _LEAST. */
 #define IP_SINGULAR 2e-2
 #define IP_DROPPED 1e-9
 #define IP_LEAST 1e-8
@@ -13,7 +12,7 @@ static double ip_size(const ip_context *c, int k)
   return k < IP_NV + IP_SPARE ? 1.0 : c->m.M[0];
 }
 
-/* out = s times the difference of two rows of the equations in these units; `less` may be null. */
+/* out = s (row - less) in units of ip_size; `less` may be null. */
 static void ip_in_units(const ip_context *c, const double *row, const double *less, double s, double *out)
 {
   int k;
@@ -23,7 +22,8 @@ static void ip_in_units(const ip_context *c, const double *row, const double *le
 }
 
 /* Decide whether the equations are independent, as LevelRank does: all singular values of the scaled rows must be
- * above 0.02.  A singular value changes at most by the change of the matrix, so most ticks need no decomposition. */
+ * above 0.02.  A singular value changes at most by the norm of the change of the matrix, so most ticks need no
+ * decomposition. */
 static void ip_measure_rank(ip_context *c)
 {
 #if IP_LEVELS
@@ -75,7 +75,7 @@ static void ip_measure_rank(ip_context *c)
 #endif
 }
 
-/* Set the lengths of the equations for the measure of their rank: each is the longest row of its level. */
+/* Set the scale of each equation to the length of the longest row of its level. */
 static void ip_begin_rank(ip_context *c)
 {
   double row[IP_VARIABLES];
@@ -143,7 +143,7 @@ static void ip_remove(double *Z, const double *v, double s, double share, int n)
 }
 
 /* Replace the rows of the levels by independent rows.  Rows that are not equations get infinite bounds.  Damped rows
- * are added to the cost: to the upper triangle of H and to g, where -g is the linear part. */
+ * become terms of the cost, in the upper triangle of H and in g.  The linear term of the cost is -g. */
 static void ip_reduce(ip_context *c, double *H, double *g)
 {
   enum { N = IP_VARIABLES };
@@ -202,7 +202,7 @@ static void ip_reduce(ip_context *c, double *H, double *g)
         }
       }
       if (x > IP_DROPPED) {
-        /* This does not change Z times the other rows, because they are orthogonal to this row. */
+        /* The products of Z and the other rows do not change, because the other rows are orthogonal to this row. */
         ip_remove(Z, v, s, 1.0 - sqrt(1.0 - alpha), N);
       }
     }

@@ -1,26 +1,26 @@
 /* The reference flow: a posture q_r that moves to lower impacts with limited speed and acceleration, while contacts
  * and tasks hold.  The posture task follows q_r.  The work of an update is spread over IP_FLOW_PHASES ticks, so that
- * no tick needs much more time.  The formulas are in impact_posture/tsid/flow/reference_flow.py. */
+ * all ticks need similar times.  The formulas are in impact_posture/tsid/flow/reference_flow.py. */
 
-/* Number of ticks per update; tick of the first change of the motion; number of ticks from the second change to the
- * next evaluation. */
+/* Number of ticks per update.  IP_FLOW_UNTIL is the tick of the first change of the acceleration.  The second change
+ * is IP_FLOW_SINCE ticks before the next evaluation. */
 #define IP_FLOW_PHASES 14
 #define IP_FLOW_UNTIL 4
 #define IP_FLOW_SINCE 3
 
-/* Step of the finite differences, rad; step towards a posture of the path below which the flow continues to the next
- * posture, rad (m). */
+/* Step of the finite differences, rad. */
 #define IP_PROBE 1e-4
+/* If the step towards a posture of the path is shorter, rad (m), the flow continues to the next posture. */
 #define IP_REACHED 0.02
 /* Least displacement between two evaluations that is used to update the curvature estimates, rad (m). */
 #define IP_MOVED 1e-6
-/* If the part of a direction that is orthogonal to earlier directions is shorter, it is orthogonalized twice. */
+/* If a direction is shorter after its orthogonalization, rounding errors are large, so it is orthogonalized twice. */
 #define IP_NEW 0.1
-/* If the velocity vector is shorter, the flow does not probe its stopping point, which is then too near. */
+/* At a lower speed, rad/s (m/s), the point where the flow would stop is too near for finite differences. */
 #define IP_SLOW 1e-3
 
-/* Evaluate the model and the rows of the constraints at a posture with v = 0; unless `error` is null, write the
- * errors. */
+/* Evaluate the model and the Jacobian of the constraints at a posture with v = 0.  Write the errors of the
+ * constraints if `error` is not null. */
 static void ip_flow_place(ip_context *c, const double *q, double *error)
 {
   static const double still[IP_NV] = {0};
@@ -69,7 +69,7 @@ static double ip_flow_evaluate(ip_flow *f, const double *q, double *slope)
   return f->failed ? NAN : value;
 }
 
-/* Replace the slope by its part on the constraints, slope - J'multiplier. */
+/* Replace the slope by the reduced gradient, slope - J'multiplier. */
 static void ip_flow_reduce(const ip_flow *f, double (*J)[IP_NV], double *slope)
 {
   int i;
@@ -78,7 +78,7 @@ static void ip_flow_reduce(const ip_flow *f, double (*J)[IP_NV], double *slope)
   }
 }
 
-/* Evaluate objective and constraints at q_r as predicted for the next change of the motion. */
+/* Evaluate objective and constraints at the predicted q_r of the next change of the motion. */
 static void ip_flow_look(ip_context *c)
 {
   ip_flow *f = &c->flow;
@@ -127,8 +127,8 @@ static void ip_flow_limit(ip_context *c)
   ip_flow_still(f);
 }
 
-/* Compute the next probe direction: the part of a fixed direction that is on the redundancy and orthogonal to the
- * earlier probes.  This direction does not depend on the basis of the redundancy. */
+/* Compute the next probe direction from a fixed direction: project it on the redundancy, and remove its components
+ * along the earlier probe directions.  The result does not depend on the basis of the redundancy. */
 static void ip_flow_aim(ip_flow *f)
 {
   double *z = f->seen[f->probed], *was = f->work, s;
@@ -137,7 +137,7 @@ static void ip_flow_aim(ip_flow *f)
     const uint32_t j = (uint32_t)(f->probed * IP_NV + i + 1);
     z[i] = (double)(uint32_t)(j * j * UINT32_C(2654435769)) / 4294967296.0 - 0.5;
   }
-  /* If the remaining part of the direction is short, a second pass makes it exact. */
+  /* If the remaining vector is short, a second pass removes the rounding errors. */
   for (again = 0, s = 0.0; again < 2 && s < IP_NEW; ++again) {
     memcpy(was, z, sizeof(double) * IP_NV);
     for (k = 0; k < f->probed; ++k) {
@@ -149,7 +149,7 @@ static void ip_flow_aim(ip_flow *f)
   }
 }
 
-/* Evaluate the gradient near the last evaluated posture; in every second update, evaluate it where the flow would
+/* Evaluate the gradient near the last evaluated posture; in every second update, at the point where the flow would
  * stop. */
 static void ip_flow_probe(ip_context *c)
 {
@@ -219,7 +219,7 @@ static void ip_flow_direct(ip_context *c)
   }
 #endif
   ip_flow_solve(f);
-  /* Only a decrease of H is a gain; a decrease in the pull or in the springs is not. */
+  /* The step also decreases the energies of pull and springs, but only the decrease of H is the gain. */
   f->gain = fmin(f->gain * ip_flow_root(f), -ip_dot(f->slope, f->wanted, IP_NV));
   f->resting = f->gain < (f->resting ? 4.0 : 1.0) * c->p.flow_epsilon[0] || f->remains <= 0.0;
   if (f->resting) {

@@ -1,10 +1,10 @@
 /* Direction of the reference flow: a saddle-free Newton step on the constraints, solved as a QP with limits.  The
  * formulas are in impact_posture/tsid/flow/flow_direction.py. */
 
-/* A smaller H/H0 is replaced by this value in the square root. */
+/* Least value of H/H0 under the square root. */
 #define IP_LEAST_VALUE 1e-8
 
-/* Write the rows of a step along f->axes, an NV x left matrix, into f->work, and their bounds. */
+/* Write the limits on a step along f->axes (NV x left) as rows into f->work, with their bounds. */
 static void ip_flow_rows(ip_flow *f)
 {
   enum { N = IP_NV };
@@ -30,8 +30,8 @@ static void ip_flow_rows(ip_flow *f)
   }
 }
 
-/* Set f->wanted = f->axes y for the least |y|^2/2 + f->steep y within the rows, or to zero if the solver fails.  With
- * u = y + f->steep, the program is the least |u|^2. */
+/* Set f->wanted = f->axes y, where y minimizes |y|^2/2 + f->steep y within the limits; set it to zero if the solver
+ * fails.  With u = y + f->steep, the program minimizes |u|^2. */
 APART static void ip_flow_solve(ip_flow *f)
 {
   enum { N = IP_NV, M = IP_FLOW_ROWS };
@@ -52,7 +52,7 @@ APART static void ip_flow_solve(ip_flow *f)
   w.scaling = f->scaling;
   w.sense = f->sense;
   if (daqp_reactivate_constraints(&w) < 0 || daqp_ldp(&w) <= 0 || w.state & DAQP_STATE_NOISE_FLOOR) {
-    /* With this flag, the solver cycled and its answer violates bounds. */
+    /* This flag means that the solver cycled and its answer violates bounds. */
     ++f->failures;
     return;
   }
@@ -70,13 +70,13 @@ APART static void ip_flow_solve(ip_flow *f)
   }
 }
 
-/* Return the square root of H/H0, or of the least permitted value if H/H0 is smaller. */
+/* Return the square root of H/H0, which is at least IP_LEAST_VALUE. */
 static double ip_flow_root(const ip_flow *f)
 {
   return sqrt(fmax(fabs(f->value / f->start), IP_LEAST_VALUE));
 }
 
-/* Write curvature and slope of 2 sqrt(H/H0) + rho/2 |q - q0|^2 on the redundancy into f->work and f->steep. */
+/* Write curvature (f->work) and slope (f->steep) of 2 sqrt(H/H0) + rho/2 |q - q0|^2 along the redundancy. */
 static void ip_flow_bend(ip_context *c)
 {
   enum { N = IP_NV };
@@ -107,8 +107,8 @@ static void ip_flow_bend(ip_context *c)
   }
 }
 
-/* Compute the variables of the Newton step from the eigenvectors of the curvature: their axes in f->axes, and the
- * slope along the axes in f->steep. */
+/* Compute the axes of the Newton step (f->axes) from the eigenvectors of the curvature, and the slope along these
+ * axes (f->steep). */
 static void ip_flow_turn(ip_context *c)
 {
   enum { N = IP_NV };
@@ -154,8 +154,7 @@ static void ip_flow_learn(ip_flow *f, const double *slope, const double *shares)
   }
 }
 
-/* Remove from a change of the flow the part that increases H now or at the displacement `stop`, where the flow stops.
- * */
+/* Remove from a change of the flow the part that increases H, now or after the displacement `stop` of braking. */
 static void ip_flow_downhill(const ip_flow *f, const double *stop, double *step)
 {
   double uphill[IP_NV], climb;

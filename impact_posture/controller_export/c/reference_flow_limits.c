@@ -1,18 +1,17 @@
 /* Limits of the reference flow: distances from the limits, and changes of the flow that do not cross them.  The
  * formulas are in impact_posture/tsid/flow/flow_direction.py. */
 
-/* Largest violation at which the flow may still move along a limit.  It is below IP_NEAR, because the flow would
- * otherwise slowly cross the limit. */
+/* Up to this violation, the flow may still move along a limit.  With IP_NEAR, it would slowly cross the limit. */
 #define IP_SPENT 9.9e-4
-/* Distances that the flow keeps: from the joint limits, rad (m); from the limits of static controls, as a share. */
+/* Distance that the flow keeps from joint limits, rad (m), and from limits of static controls, as a share. */
 #define IP_AIM 2e-3
 #define IP_RESERVE 8e-3
-/* Squared length of a row, projected on the constraints, below which the row cannot be corrected. */
+/* If the squared length of a row in the free directions is smaller, motions along these directions cannot correct it. */
 #define IP_FLAT 1e-6
 /* If the sine of the tilt is smaller, the slope of the tilt is set to zero, because the tilt axis is undefined. */
 #define IP_LEVEL 1e-6
 
-/* The largest absolute value from the entry `first` on. */
+/* Return the largest absolute value from the entry `first` on. */
 static double ip_largest(const double *x, int first)
 {
   double most = 0.0;
@@ -23,8 +22,8 @@ static double ip_largest(const double *x, int first)
   return most;
 }
 
-/* Return the change of the value of a row for a displacement.  A rotation of the base across the tilt axis increases
- * the tilt to second order. */
+/* Return the change of a limited quantity (row r) by a displacement.  A rotation of the base across the tilt axis
+ * increases the tilt to second order. */
 static double ip_flow_ahead(const ip_flow *f, int r, const double *moved)
 {
   const double along = r < IP_JOINTS_V               ? moved[IP_BASE + r]
@@ -40,8 +39,7 @@ static double ip_flow_ahead(const ip_flow *f, int r, const double *moved)
   return along;
 }
 
-/* Compute the bounds of the rows on the step at the posture of the flow, tightened by the braking distance of the
- * flow. */
+/* Compute the limits on the step at the posture of the flow, tightened by the braking distance of the flow. */
 static void ip_flow_limits(ip_context *c)
 {
   ip_flow *f = &c->flow;
@@ -101,7 +99,7 @@ static void ip_flow_limits(ip_context *c)
   }
 }
 
-/* Displacement of the flow within a time after a change of its velocity. */
+/* Compute the displacement within a time after the change `step` of the velocity of the flow. */
 static void ip_flow_after(const ip_flow *f, const double *step, double time, double *moved)
 {
   int i;
@@ -110,7 +108,7 @@ static void ip_flow_after(const ip_flow *f, const double *step, double time, dou
   }
 }
 
-/* Remove from a change of the flow, row by row, the parts that cross limits within a time. */
+/* Remove from a change of the flow, limit by limit, the parts that cross limits within a time. */
 static void ip_flow_along_limits(const ip_flow *f, double time, double *step)
 {
   double moved[IP_NV], across[IP_NV], over, square;

@@ -1,15 +1,14 @@
 /* Motion of the reference flow: its governor, its start, and the tasks that follow the flow. */
 
-/* Time constant of the return to contacts and tasks, s; speed below which a flow that is off is set to rest, rad/s
- * (m/s). */
+/* Time constant of the return to contacts and tasks, s.  IP_STILL is the speed below which a flow that is off is set
+ * to rest, rad/s (m/s). */
 #define IP_RETURN 0.1
 #define IP_STILL 1e-5
 /* Largest violation of a limit during braking, rad (m) for joints, and a share of the range for static controls. */
 #define IP_NEAR 1e-3
-/* Number of attempts per candidate: first unchanged, then twice without the part that crosses limits. */
+/* Attempts per candidate of ip_flow_change: first unchanged, then twice without the part that crosses limits. */
 #define IP_ATTEMPTS 3
-/* Least share of the acceleration that is assumed to be available for braking.  Also the largest increase of this
- * share by one change. */
+/* Least share of the acceleration that the flow assumes for braking, and largest increase of this share per change. */
 #define IP_ABLE 0.1
 /* Safety factor of the braking time, because the slopes of the limits change during braking. */
 #define IP_CAUTION 1.5
@@ -26,7 +25,7 @@ static void ip_shorten(double *x, double most)
 }
 
 /* Compute a velocity that changes the constraints at a rate.  Of all such velocities, the result has the slowest
- * joints, with the factor computed by ip_flow_still. */
+ * joints.  Call ip_flow_still first. */
 static void ip_flow_moving(const ip_flow *f, const double *rate, double *back)
 {
   int i;
@@ -74,8 +73,8 @@ static void ip_flow_back(ip_context *c, double period, double *back)
   ip_add(back, 1.0, f->returning, IP_NV);
 }
 
-/* Return the time at constant velocity that equals the motion of one change and the braking after it.  The
- * deceleration is the one that the actuators permitted lately. */
+/* Return the time in which the new velocity covers the distance of the change and of the braking.  The assumed
+ * deceleration is the one that the actuators permitted in the last changes. */
 static double ip_flow_braking(const ip_flow *f, const ip_params *p, const double *step, double period)
 {
   double after[IP_NV];
@@ -99,8 +98,8 @@ static int ip_flow_stops(const ip_flow *f, const ip_params *p, const double *ste
   return 1;
 }
 
-/* Scale the flow after a change down to the largest speed.  The removal of a part that crosses a limit can speed up
- * other joints. */
+/* Limit a change so that the flow stays within its speed limit.  The removal of a part that crosses a limit can speed
+ * up other joints. */
 static void ip_flow_bound_speed(const ip_flow *f, const ip_params *p, double *step)
 {
   double after[IP_NV];
@@ -124,7 +123,7 @@ static int ip_flow_change(const ip_flow *f, const ip_params *p, double period, d
   int i, k, attempt;
   for (i = 0; i < N; ++i) {
     wanted[i] = pace * f->wanted[i];
-    /* This is twice the braking distance, because the curvature may increase during braking. */
+    /* The displacement `stop` is twice the braking distance, because the curvature may increase during braking. */
     stop[i] = time * f->flow[i];
   }
   ip_shorten(wanted, fastest);
@@ -159,7 +158,7 @@ static int ip_flow_change(const ip_flow *f, const ip_params *p, double period, d
   return 1;
 }
 
-/* Set the acceleration of the flow: limited, and with the return to contacts and tasks. */
+/* Set the acceleration of the flow, which includes the return to contacts and tasks, within all limits. */
 static void ip_flow_govern(ip_context *c)
 {
   enum { N = IP_NV };
@@ -177,8 +176,8 @@ static void ip_flow_govern(ip_context *c)
   if (f->on && !f->resting && f->visited == IP_PATH) {
     f->moved += period;
   }
-  /* The flow keeps this speed until the next change.  The change after that one must stop the flow in the remaining
-   * time with 2/5 of the acceleration. */
+  /* The flow keeps this speed until the next change.  From there on, 2/5 of the acceleration must suffice to stop the
+   * flow in the remaining time. */
   f->remains = fmin(f->deadline - f->clock, p->flow_duration[0] - f->moved) - 2.0 * period;
   fastest = fmin(fastest, 0.4 * p->flow_acceleration[0] * fmax(f->remains, 0.0));
   fastest = f->on ? fastest : 0.0;
@@ -275,8 +274,8 @@ static int ip_flow_begin(ip_context *c)
   return 1;
 }
 
-/* Compute a part of the eigenvalues of the curvature; at the last tick, also compute the variables of the Newton
- * step. */
+/* Do the part of the eigenvalue decomposition of the curvature that belongs to this tick.  At the last of these
+ * ticks, also compute the axes of the Newton step. */
 static void ip_flow_curve(ip_context *c)
 {
   enum { BEND = 7, TRIDIAGONAL = 8, LAST = 12 };

@@ -2,19 +2,20 @@
  * impact_posture/tsid/flow/redundancy.py and static_controls.py. */
 
 /* If the singular value of a direction is below this share of the largest, the direction gets a spring instead of a
- * constraint.  Stiffness of the springs relative to H0, 1/m2. */
+ * constraint.  IP_STIFFNESS is the stiffness of the springs relative to H0, 1/m2. */
 #define IP_SLACK 2e-2
 #define IP_SPRING 3e4
-/* Weight of a moment (N m), relative to a force (N); share of the trace that makes the equations solvable. */
+/* Weight of a moment (N m), relative to a force (N), in the norm of contact wrenches.  IP_TINY is the share of the
+ * trace that is added to the diagonal, so that the equations are solvable. */
 #define IP_MOMENT 100.0
 #define IP_TINY 1e-12
-/* A point with a smaller distance from a line, m, is treated as a point on the line. */
+/* Points with a smaller distance from a line, m, are treated as points on the line. */
 #define IP_ON_LINE 1e-9
-/* Small regularization for base motions that leave the joints at rest. */
+/* Added to the diagonal of equations that are singular if the base can move while the joints are at rest. */
 #define IP_IDLE 1e-9
 /* Accelerations may always use at least this share of the half range of a control. */
 #define IP_LEFT 0.1
-/* Share of the weight of which each sole carries an equal part. */
+/* Each of n soles carries at least this share of the weight, divided by n. */
 #define IP_EVEN 0.6
 
 #if IP_BASE
@@ -37,8 +38,8 @@ static void ip_solve_factor(const double *R, int n, double *b)
 }
 #endif
 
-/* Write eigenvectors and eigenvalues of JJ' into f->work.  This is exact enough for singular values above 2 % of the
- * largest. */
+/* Write eigenvectors and eigenvalues of JJ' into f->work.  The squares of singular values above 2 % of the largest
+ * are exact enough. */
 static void ip_flow_decompose(ip_context *c)
 {
   enum { N = IP_NV, M = IP_HELD };
@@ -53,8 +54,8 @@ static void ip_flow_decompose(ip_context *c)
   f->most = ip_eigen(G, G + M * M, M);
 }
 
-/* From the eigenvectors, J = U S V' is known.  Compute the pseudo-inverse on the constrained directions, and an
- * orthonormal basis of the free directions in the rows of Z. */
+/* Compute the pseudo-inverse of J on the constrained directions, and an orthonormal basis of the free directions in
+ * the rows of Z, from the eigenvectors of JJ'. */
 static void ip_flow_space(ip_flow *f)
 {
   enum { N = IP_NV, M = IP_HELD };
@@ -71,9 +72,9 @@ static void ip_flow_space(ip_flow *f)
   for (i = 0; i < N; ++i) {
     ip_combine(f->inverse + i * M, M, held + i, N, U, M, rank);
   }
-  /* Reflections that map the rows of constrained directions to the first unit vectors map Z to the other unit
-   * vectors. The product of the reflections is I - V'RV, where the rows of V are their vectors and R is upper
-   * triangular (Golub and Van Loan, section 5.1.7).  T is R'. */
+  /* Compute reflections that map the constrained directions to the first unit vectors.  The same reflections map Z to
+   * the other unit vectors.  Their product is I - V'RV, where the rows of V are the vectors of the reflections and R
+   * is upper triangular (Golub and Van Loan, section 5.1.7).  T is R'. */
   for (k = 0; k < rank; ++k) {
     double *v = held + k * N, size = sqrt(ip_dot(v + k, v + k, N - k));
     v[k] += v[k] < 0.0 ? -size : size;
@@ -107,7 +108,7 @@ static void ip_flow_space(ip_flow *f)
   }
 }
 
-/* Compute a factor of the joint part of Z, with which the return to the constraints moves the joints least. */
+/* Factorize the product of the joint part of Z with itself, for ip_flow_moving. */
 static void ip_flow_still(ip_flow *f)
 {
 #if IP_BASE
@@ -247,7 +248,7 @@ static void ip_flow_polygon(ip_context *c)
     const int sole = ip_contact_row[i / 4 + 1] - ip_contact_row[i / 4] == 6;
     for (j = 0; j < 2; ++j) {
       x[i][j] = c->m.position[ip_contact_point[i / 4]][j];
-      /* The model has no rotation of point contacts. */
+      /* Point contacts have no corners, and the model has no rotation of their frames. */
       x[i][j] += sole ? (i & 1 ? 1.0 : -1.0) * half[0] * R[3 * j] + (i & 2 ? 1.0 : -1.0) * half[1] * R[3 * j + 1] : 0.0;
     }
     ip_add(mean[i % 4], 1.0 / IP_CONTACTS, x[i], 2);
@@ -257,7 +258,7 @@ static void ip_flow_polygon(ip_context *c)
     for (j = 0; j < 2; ++j) {
       x[i][j] += even * (mean[i % 4][j] - x[i][j]);
     }
-    /* Start at the leftmost corner, not at a point between two corners. */
+    /* Start at the leftmost corner; of several, at the lowest, which is not between two corners. */
     start = x[i][0] < x[start][0] - IP_ON_LINE || (x[i][0] <= x[start][0] + IP_ON_LINE && x[i][1] < x[start][1]) ? i
                                                                                                                 : start;
   }

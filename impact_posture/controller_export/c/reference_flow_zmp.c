@@ -1,12 +1,12 @@
 /* Bounds on the acceleration that keep the zero moment point of a standing robot in the polygon of its feet.  The
  * formulas are in impact_posture/tsid/flow/zero_moment_point.py. */
 
-/* Share of the distance from the center of mass to an edge that accelerations may use; least value of this distance,
- * m. */
+/* Accelerations may use this share of the distance from the center of mass to an edge.  The distance counts as at
+ * least IP_ZMP_LEAST, m. */
 #define IP_ZMP_SHARE 0.8
 #define IP_ZMP_LEAST 0.01
 
-/* Set the rows and their bounds, from which the part of a known acceleration is subtracted. */
+/* Set the rows and their bounds.  The effect of the known acceleration is subtracted from the bounds. */
 static void ip_flow_limit_zmp(ip_flow *f, const double *known)
 {
 #if IP_CONTACTS

@@ -1,4 +1,5 @@
-/* Factorize the reduced cost plus `share` of its largest entry; return 0 if it is not positive definite. */
+/* Factorize the Hessian in the remaining coordinates, with `share` of its largest diagonal entry added to the
+ * diagonal.  Return 0 if this matrix is not positive definite. */
 static int factorize(Relaxation *r, double share) {
     const int n = r->n, free = n - r->fixed;
     const double *Z = r->Z + r->fixed, *H = r->p->H;
@@ -9,7 +10,7 @@ static int factorize(Relaxation *r, double share) {
     }
     ip_combine(r->wanted, free, gradient, 1, Z, n, n);
     for (int i = 0; i < free; i++) {
-        /* Compute more than the lower triangle, because two entries are added at once. */
+        /* Compute up to four entries above the diagonal, because ip_combine is fastest for multiples of four. */
         ip_combine(r->L + i * n, i + 4 < free ? i / 4 * 4 + 4 : free, Z + i, n, HZ, n, n);
         largest = fmax(largest, r->L[i * n + i]);
     }
@@ -25,7 +26,7 @@ static int factorize(Relaxation *r, double share) {
     return 1;
 }
 
-/* Transform whitened coordinates to the coordinates of Z. */
+/* Transform whitened coordinates, in which the Hessian is the identity, to the coordinates of Z. */
 static void unwhiten(const Relaxation *r, double *y) {
     for (int i = r->n - r->fixed - 1; i >= 0; i--) {
         y[i] *= r->L[i * r->n + i];
@@ -33,8 +34,7 @@ static void unwhiten(const Relaxation *r, double *y) {
     }
 }
 
-/* Move to the exact minimum of the cost while the active rows keep their values.  The program with a proximal term
- * does not reach this minimum. */
+/* Move to the minimum of the cost without the proximal term, while the active rows keep their values. */
 static void finish_cost(Relaxation *r) {
     for (int k = 0; k < MOST_MOVES; k++) {
         hold_rows(r, 1);
@@ -50,8 +50,8 @@ static void finish_cost(Relaxation *r) {
     }
 }
 
-/* Minimize the cost in the remaining coordinates.  A program with a proximal term determines the active rows, because
- * the cost may be too flat for a program without this term.  Then the point moves to the minimum. */
+/* Minimize the cost in the remaining coordinates.  First, a program with a proximal term determines the active rows,
+ * because the cost alone may be too flat.  Then the point moves to the minimum of the cost. */
 static int solve_cost(Relaxation *r) {
     const int free = r->n - r->fixed;
     int flag = 0;

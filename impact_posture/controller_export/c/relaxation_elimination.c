@@ -42,7 +42,7 @@ static void turn_row(const Relaxation *r, double *row) {
 
 static void clear_rows(Relaxation *r) { r->exact = r->near = r->rank = 0; }
 
-/* Add a row to the list of rows that reach their goals exactly.  These rows depend only on the first `rank` reflected
+/* Add an entry to the exact rows, which reach their goals.  They depend only on the first r->rank reflected
  * coordinates. */
 static void add_exact(Relaxation *r, int entry) {
     const int n = r->n, rank = r->rank, free = n - r->fixed;
@@ -58,8 +58,7 @@ static void add_exact(Relaxation *r, int entry) {
     r->rows[r->exact++] = entry;
 }
 
-/* Add a row to the list of rows that approach their goals by least squares.  It overwrites a row of the last program
- * in M. */
+/* Add an entry to the close rows, which approach their goals by least squares.  This overwrites a row of r->M. */
 static void add_near(Relaxation *r, int entry) {
     double *b = r->M + r->near * r->n;
     memcpy(b, motion(r, entry), (size_t)(r->n - r->fixed) * sizeof *b);
@@ -75,8 +74,9 @@ static void swap(double *a, double *b, int count) {
     }
 }
 
-/* Compute the step r->step by which the listed rows reach or approach their goals.  Return the number of reflected
- * coordinates that the step uses.  The coordinates after r->rank belong to the first rows in r->close. */
+/* Compute the step r->step after which exact rows reach their goals and close rows approach their goals.  Return the
+ * number of reflected coordinates that the step uses.  The coordinates after r->rank belong to the first close rows.
+ * */
 static int find_step(Relaxation *r) {
     const int n = r->n, rank = r->rank, free = n - r->fixed, rest = free - rank;
     double *step = r->step, *C = r->L, *rhs = r->rhs, *square = r->column, longest = 0;
@@ -111,7 +111,7 @@ static int find_step(Relaxation *r) {
         for (int i = used; i < r->near; i++) {
             double *b = C + i * n + used;
             reflect(v, *tau, b, rest - used);
-            /* If a row nearly depends on earlier rows, the difference has few correct digits. */
+            /* If the row nearly depends on earlier rows, the difference would have few correct digits. */
             if (b[0] * b[0] < (1 - 1e-6) * square[i])
                 square[i] -= b[0] * b[0];
             else
@@ -127,7 +127,7 @@ static int find_step(Relaxation *r) {
     return rank + used;
 }
 
-/* Mark the listed rows as held or free. */
+/* Mark the exact and close rows as held or free. */
 static void hold_rows(Relaxation *r, int held) {
     for (int i = 0; i < r->exact; i++) r->held[r->rows[i]] = held;
     for (int i = 0; i < r->near; i++) r->held[r->close[i]] = held;
@@ -160,7 +160,7 @@ static int move(Relaxation *r) {
 static void eliminate(Relaxation *r, int rank) {
     const int n = r->n, free = n - r->fixed, rest = free - rank;
     if (rest < rank) {
-        /* If few coordinates remain, it is faster to compute Z times each of them. */
+        /* If few coordinates remain, it is faster to multiply Z by each unit vector. */
         for (int c = 0; c < rest; c++) {
             double *e = r->B + c * n;
             memset(e, 0, (size_t)free * sizeof *e);

@@ -1,7 +1,7 @@
 /* ---- least-distance programs ---------------------------------------------------------------------------------- */
 
-/* List the inequalities of the levels above `level` and, as soft rows, all rows of `level`.  If there is a factor L
- * of the cost, the rows are in whitened coordinates. */
+/* Write the rows of the program of a level: the inequalities of the levels above, and all rows of `level` as soft
+ * rows.  If L, the factor of the Hessian, is not null, transform the rows to whitened coordinates. */
 static void list_rows(Relaxation *r, int level, const double *L) {
     const int free = r->n - r->fixed;
     const int *warm = r->warm + level * r->entries;
@@ -23,8 +23,8 @@ static void list_rows(Relaxation *r, int level, const double *L) {
         }
         r->size[count] = size;
         ip_scaled(row, 1 / size, row, free);
-        /* The tolerance of a row is relative to its length in the units of the problem.  In the program of the cost,
-         * the tolerance is as small as rounding errors, and the active rows are corrected later. */
+        /* DAQP scales the tolerance of a row by this number.  For levels, the tolerance is relative to the length of
+         * the row in the units of the problem.  For the cost, the tolerance is as small as rounding errors. */
         r->daqp.scaling[count] = L ? 1 : r->length[i] / size;
         const double ratio = longest / r->length[i];
         r->daqp.rho_ls[count] = r->daqp.rho_us[count] = STEP_WEIGHT * ratio * ratio;
@@ -36,7 +36,8 @@ static void list_rows(Relaxation *r, int level, const double *L) {
     r->daqp.n = free;
 }
 
-/* Set the bounds relative to the present point, or to the minimum of the cost, and return their unit. */
+/* Set the bounds of the program relative to the present point or, with `wanted`, to the minimum of the cost.  Divide
+ * the bounds by their size, and return this size. */
 static double set_bounds(Relaxation *r, const double *wanted) {
     const int free = r->n - r->fixed;
     double largest = 0, size = 1;
@@ -80,7 +81,7 @@ static void keep_active(Relaxation *r, int level) {
     for (int j = 0; j < r->count; j++) warm[r->entry[j]] = r->daqp.sense[j] & (DAQP_ACTIVE | DAQP_LOWER);
 }
 
-/* List the active rows of a program that are not soft. */
+/* Make the active rows of a program that are not soft the exact rows. */
 static void list_active(Relaxation *r) {
     clear_rows(r);
     for (int j = 0; j < r->daqp.n_active; j++) {
@@ -91,8 +92,8 @@ static void list_active(Relaxation *r) {
     }
 }
 
-/* After a whole move, remove unnecessary rows from the lists: exact rows whose multiplier is zero or has the wrong
- * sign, and inequalities that hold.  Return whether rows were removed. */
+/* After a move that no bound stopped, remove exact rows whose multiplier is zero or has the wrong sign, and remove
+ * close rows that are inequalities and hold.  Return whether rows were removed. */
 static int drop_rows(Relaxation *r) {
     double *force = r->column, most = 0, square = 0;
     const int exact = r->exact, near = r->near;
@@ -117,15 +118,15 @@ static int drop_rows(Relaxation *r) {
         r->rhs[i] *= r->goal[row] == r->upper[row] ? 1 : -1;
         if (r->rhs[i] < r->rhs[worst]) worst = i;
     }
-    /* If many bounds meet and the last move brought no progress, remove only the worst row.  Otherwise, the other
-     * removed rows would stop the move. */
+    /* If the last move brought no progress, remove only the exact row with the worst multiplier.  Removing more rows
+     * could stop the next move at once, where many bounds meet. */
     const int all = square < (1 - PROGRESS) * r->square;
     for (int i = 0; i < exact; i++)
         if (most > 0 && (r->rhs[i] > COUNTS * most || (!all && i != worst))) r->rows[exacts++] = r->rows[i];
     for (int i = 0; i < near; i++)
         if (is_equation(r, r->close[i]) || violation(r, r->close[i]) > least(r, r->close[i])) r->close[nears++] = r->close[i];
-    /* Keep inequalities that are exactly at their bounds.  If removed, they would stop the move again, without an
-     * end. */
+    /* If the last move brought no progress and no exact row is removed, keep all rows.  The iteration could otherwise
+     * repeat without end. */
     if (exacts + nears == exact + near || (exacts == exact && !all)) return 0;
     r->square = square;
     clear_rows(r);
@@ -134,8 +135,8 @@ static int drop_rows(Relaxation *r) {
     return 1;
 }
 
-/* List the rows that determine the answer of the level: its equations and violated rows.  If the level cannot hold,
- * list the active rows of the levels above first. */
+/* Make the equations and the violated rows of the level the close rows.  If the level cannot hold, make the active
+ * rows of the levels above the exact rows. */
 static void list_held(Relaxation *r, int level, int missed) {
     clear_rows(r);
     if (missed) list_active(r);
@@ -146,8 +147,8 @@ static void list_held(Relaxation *r, int level, int missed) {
     }
 }
 
-/* Compute the exact answer of a level from approximate active rows, and return the number of coordinates that it
- * uses. */
+/* Compute the exact solution of a level from approximate active rows.  Return the number of reflected coordinates
+ * that the level determines. */
 static int finish_level(Relaxation *r, int level, int missed) {
     int last = -1;
     r->square = INFINITY;
@@ -166,14 +167,14 @@ static int finish_level(Relaxation *r, int level, int missed) {
         else
             add_near(r, stop);
     }
-    /* The point may not be optimal for this level, but it is accepted, and its rows keep their values. */
+    /* The moves did not reach the optimum of the level.  Accept the point, so that its rows keep their values. */
     list_held(r, level, missed);
     for (int i = 0; i < r->exact; i++) r->goal[r->rows[i]] = r->value[r->rows[i]];
     for (int i = 0; i < r->near; i++) r->goal[r->close[i]] = r->value[r->close[i]];
     return find_step(r);
 }
 
-/* Minimize the error of a level as far as the levels above permit.  After that, the level keeps its error. */
+/* Minimize the error of a level without a change of the errors of the levels above.  Later levels keep this error. */
 static int solve_level(Relaxation *r, int level) {
     int missed = 0, same = 0;
     list_rows(r, level, NULL);
@@ -183,7 +184,7 @@ static int solve_level(Relaxation *r, int level) {
         r->daqp.reuse_ind = 0;
         int flag = k ? run(r) : start(r);
         if (flag <= 0 && flag != DAQP_EXIT_ITERLIMIT && !k) {
-            /* The solver failed.  A program with a larger weight is easier to solve. */
+            /* The solver failed.  A larger weight of the step makes the program easier to solve. */
             for (int j = 0; j < r->count; j++) r->daqp.rho_us[j] = r->daqp.rho_ls[j] *= 100;
             flag = start(r);
         }
@@ -198,12 +199,12 @@ static int solve_level(Relaxation *r, int level) {
         same = !missed || (k && left - r->left == 1);
     }
     const int rank = finish_level(r, level, missed);
-    /* Rounding errors can still change a dependent row, so an inequality stays an inequality. */
+    /* Eliminate equations.  Inequalities stay in the program, because rounding errors can still change them. */
     for (int i = 0; i < r->exact; i++) r->held[r->rows[i]] = is_equation(r, r->rows[i]);
     for (int i = 0; i < r->near; i++) r->held[r->close[i]] = is_equation(r, r->close[i]);
     for (int k = 0; k < rank; k++) r->held[k < r->rank ? r->rows[r->lead[k]] : r->close[k - r->rank]] = 1;
     eliminate(r, rank);
-    /* The point is accepted as a solution, so the bounds are widened by the rounding errors of its rows. */
+    /* Widen the bounds by the rounding errors of the accepted point. */
     for (int i = 0; i < r->entries; i++)
         if (r->p->level[i] <= level) {
             r->lower[i] = fmin(r->lower[i], r->value[i]);

@@ -5,15 +5,15 @@
 
 #include "daqp.h"
 
-/* DAQP approximates the active rows of a level in steps from the last answer.  This is the weight of the squared step
- * relative to the violation.  Moves with eliminated rows then lead to the exact answer; a bound may stop a move.  A
- * move counts as MOVE_COST iterations per row, because it needs as much time as so many iterations. */
+/* DAQP approximates the active rows of a level in at most MOST_STEPS steps.  STEP_WEIGHT is the weight of the squared
+ * step relative to the squared violation.  At most MOST_MOVES moves then lead to the exact answer.  A move takes as
+ * much time as MOVE_COST iterations per row. */
 #define STEP_WEIGHT 1e-5
 #define MOST_STEPS 4
 #define MOST_MOVES 60
 #define MOVE_COST 0.1
-/* Largest violation of a bound by DAQP, and largest violation that is treated as zero, relative to the numbers of the
- * problem. */
+/* DAQP may violate bounds by EXACT.  Violations up to COUNTS are treated as zero.  Both are relative to the norm of
+ * the row times the norm of z. */
 #define EXACT 1e-9
 #define COUNTS 1e-7
 /* Least relative decrease of a sum of squares. */
@@ -22,36 +22,36 @@
 #define WRONG 1e-7
 /* Largest violation of a bound in the program of the cost, relative to its unit. */
 #define ROUNDING 1e-10
-/* Relative to the length of the whole row: the remaining length below which a row cannot change any more, and the
- * least pivot of an elimination. */
+/* Relative to the length of the whole row: below the remaining length FLAT, a row is constant; PIVOT is the least
+ * pivot of an elimination. */
 #define FLAT 1e-12
 #define PIVOT 1e-8
-/* Proximal terms of the reduced cost, relative to its largest entry, in the order of the attempts. */
+/* Proximal terms relative to the largest diagonal entry of the Hessian, in the order of the attempts. */
 static const double PROXIMAL[] = {1e-5, 1e-3};
 
 typedef struct {
     const relaxation_problem *p;
-    int n, entries, fixed, left; /* numbers: variables, entries of [z; A z], eliminated coordinates, iterations left */
+    int n, entries, fixed, left; /* number of variables, entries of [z; A z], eliminated coordinates, iterations left */
     double *Z, *T;               /* Z, n x n: z can move along the columns from `fixed` on; T = A Z for known rows */
-    double *z, *value, *lower, *upper, *length; /* the point, [z; A z], widened bounds, lengths in `unit` */
+    double *z, *value, *lower, *upper, *length; /* present z, [z; A z], widened bounds, lengths of rows in `unit` */
     int *first, *last, *known;   /* range of a row's nonzero entries; `fixed` at the last computation of its motion */
     int *held;                   /* whether each entry is eliminated */
-    double *goal;                /* desired values of listed rows */
+    double *goal;                /* desired values of exact and close rows */
     double *B, *v, *tau, *rhs, *step, *column; /* work arrays of an elimination */
     double *motion_z;                 /* Z times a step */
-    int *rows, *lead, *close;    /* exact rows; exact row of the k-th reflection; least-squares rows */
-    int exact, near, rank;       /* numbers: exact rows, least-squares rows, coordinates that the exact rows use */
-    double *L, *wanted;          /* factor of the reduced cost (1/L on the diagonal), its minimum in whitened coordinates */
+    int *rows, *lead, *close;    /* exact rows; exact row of the k-th reflection; close rows (least squares) */
+    int exact, near, rank;       /* number of exact rows, of close rows, and of coordinates that the exact rows use */
+    double *L, *wanted;          /* factor of the Hessian (1/L on the diagonal); minimum of the cost, whitened */
     DAQPWorkspace daqp;
     DAQPSettings settings;
-    double *M, *size;            /* normalized rows of a least-distance program, and their former lengths */
-    int *entry, count;           /* entries of these rows */
+    double *M, *size;            /* rows of the program, scaled to the length 1, and their original lengths */
+    int *entry, count;           /* entry of [z; A z] of each row in M; number of these rows */
     int *warm;                   /* (levels + 2) x entries: active rows of each program in the last call */
-    double square;               /* sum of squared errors of a level after its last whole move */
-    double tolerance, scale;     /* violation that DAQP may leave; size of the point, in `unit` */
+    double square;               /* sum of squared errors of a level after the last move that no bound stopped */
+    double tolerance, scale;     /* violation that DAQP may leave; largest entry of z, in `unit` */
 } Relaxation;
 
-/* Place an array after the earlier ones; if base is null, only count its bytes. */
+/* Return an array after the earlier arrays in the workspace; if base is null, only count its bytes. */
 static void *take(char *base, size_t *used, size_t count, size_t size) {
     char *array = base ? base + *used : NULL;
     *used += (count * size + sizeof(double) - 1) / sizeof(double) * sizeof(double);
@@ -75,7 +75,7 @@ static size_t place(Relaxation *r, char *base, size_t n, size_t m, size_t levels
         {&r->lead, n}, {&r->close, e}, {&r->entry, e},
         {&r->daqp.sense, e}, {&r->daqp.WS, active}, {&r->daqp.prox_mask, n},
     };
-    /* The active rows come first, because the next call uses them. */
+    /* The active rows (`warm`) come first, because the next call reads them. */
     for (size_t k = 0; k < sizeof ints / sizeof *ints; k++)
         *ints[k].array = take(base, &used, ints[k].count, sizeof(int));
     for (size_t k = 0; k < sizeof doubles / sizeof *doubles; k++)

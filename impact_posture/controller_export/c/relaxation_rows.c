@@ -2,7 +2,7 @@
 
 static double norm(const double *a, int n) { return sqrt(ip_dot(a, a, n)); }
 
-/* Derivative of an entry with respect to the remaining coordinates. */
+/* Return the derivative of an entry of [z; A z] with respect to the remaining coordinates. */
 static const double *motion(const Relaxation *r, int entry) {
     const int n = r->n, row = entry - n;
     if (row < 0) return r->Z + entry * n + r->fixed;
@@ -15,7 +15,7 @@ static const double *motion(const Relaxation *r, int entry) {
     return T;
 }
 
-/* Value of an entry of [z; A z]. */
+/* Return the value of an entry of [z; A z]. */
 static double entry_of(const Relaxation *r, const double *z, int entry) {
     const int row = entry - r->n;
     if (row < 0) return z[entry];
@@ -29,10 +29,10 @@ static double violation(const Relaxation *r, int entry) {
     return fmax(r->lower[entry] - r->value[entry], r->value[entry] - r->upper[entry]);
 }
 
-/* Largest violation of an entry that is treated as zero. */
+/* Return the largest violation of an entry that is treated as zero. */
 static double least(const Relaxation *r, int entry) { return COUNTS * r->scale * r->length[entry]; }
 
-/* Set r->motion_z to the motion of z for a step in the remaining coordinates. */
+/* Set r->motion_z to the change of z by a step in the remaining coordinates. */
 static void find_motion(Relaxation *r, const double *step) {
     for (int i = 0; i < r->n; i++) r->motion_z[i] = ip_dot(r->Z + i * r->n + r->fixed, step, r->n - r->fixed);
 }

@@ -32,8 +32,8 @@ static void ip_add_turned(const ip_context *c, const double *x, double *out)
   }
 }
 
-/* Compute z = [v; w; f] from u, and correct z once, so that the active rows hold to the last digit.  This is
- * necessary, because large weights of the cost make the variables of DAQP less exact. */
+/* Compute z = [v; w; f] from u.  Then correct z, so that the active rows hold to the last digit, because large
+ * weights of the cost make the variables of DAQP less exact. */
 static void ip_decode(ip_context *c, DAQPWorkspace *w)
 {
   double x[IP_VARIABLES];
@@ -74,7 +74,7 @@ static void ip_decode(ip_context *c, DAQPWorkspace *w)
   ip_add_turned(c, x, c->z);
 }
 
-/* Memory of DAQP on the stack, large enough for both programs of a tick. */
+/* Memory of DAQP on the stack, large enough for the QP of a tick and the QP of the flow. */
 typedef struct {
   double lam[IP_VARIABLES + 1], lam_star[IP_VARIABLES + 1], xldl[IP_VARIABLES + 1], zldl[IP_VARIABLES + 1];
   double D[IP_VARIABLES + 1], L[(IP_VARIABLES + 1) * (IP_VARIABLES + 2) / 2], xold[IP_VARIABLES];
@@ -83,8 +83,8 @@ typedef struct {
   DAQPSettings settings;
 } ip_memory;
 
-/* Prepare a program with n variables and m bounds and rows, of which `simple` are bounds.  The caller sets bounds and
- * rows. */
+/* Prepare a program with n variables, `simple` bounds on variables and m - `simple` rows.  The caller sets the
+ * numbers of bounds and rows. */
 static void ip_prepare(ip_memory *s, int n, int simple, int m, double *u, DAQPWorkspace *w)
 {
   memset(s->prox, 0, sizeof s->prox);
@@ -124,7 +124,7 @@ static int ip_solve_warm(ip_context *c)
   flag = flag < 0 ? flag : daqp_ldp(&w);
   c->iterations += w.iterations;
   if (w.state & DAQP_STATE_NOISE_FLOOR) {
-    /* DAQP cycled and treated violated bounds as rounding errors. */
+    /* DAQP cycled, and its answer violates bounds. */
     flag = DAQP_EXIT_CYCLE;
   }
   memset(c->multipliers, 0, sizeof c->multipliers);

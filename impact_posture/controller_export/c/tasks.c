@@ -1,6 +1,6 @@
 /* Tasks and joint limits at the state in the context. */
 
-/* Kinds of tasks, as in ip_task_kind. */
+/* Task classes, the values of ip_task_kind. */
 enum { IP_TILT, IP_BASE_TURN, IP_MASS_CENTER, IP_POSITION, IP_POSE, IP_ALIGNED };
 /* Values of c->phase. */
 enum { IP_FREE, IP_BRACE, IP_CONTACT, IP_RELEASE };
@@ -104,7 +104,7 @@ static void ip_present(const ip_context *c, int k, ip_target *target)
   target->set = 1.0;
 }
 
-/* Complete e, which begins with the difference of the origins, to log6 of the motion to a pose, in world axes. */
+/* Compute log6 of the motion to a pose, in world axes.  At the call, e begins with the difference of the origins. */
 static void ip_pose_error(const double *R, const double *wanted, double *e)
 {
   double relative[9], w[3], p[3], linear[3];
@@ -116,7 +116,7 @@ static void ip_pose_error(const double *R, const double *wanted, double *e)
   ip_turn(R, w, 0, e + 3);
 }
 
-/* Write error e, Jacobian J unless it is constant, and drift of a task, with the quantities m of the robot at q. */
+/* Write error e, Jacobian J (unless it is constant) and drift of a task.  m is the model of the robot at q. */
 static void ip_task_output(const ip_target *target, int k, const ip_model *m, const double *q, double *J, double *e,
                            double *drift)
 {

@@ -1,8 +1,8 @@
-/* Functions of the controller. */
+/* Functions of the header: reset, tick, and changes of targets and phases. */
 
-/* Limit on the time step of ramps, in periods, for a tick after a long pause. */
+/* Largest time step of ramps, in periods.  A tick after a long pause would otherwise end a ramp. */
 #define IP_LONGEST 10.0
-/* Largest sum of squares of a valid measurement (1e8 m, rad/s or N). */
+/* A measurement is invalid if the sum of its squares is larger (numbers of about 1e8 m, rad/s or N). */
 #define IP_ABSURD 1e16
 /* Times with a smaller difference, s, are equal, because sums of periods are not exact. */
 #define IP_SAME 1e-9
@@ -85,7 +85,7 @@ static void ip_answer(ip_context *c, ip_command *out)
   }
   flag = c->independent ? ip_solve_warm(c) : 0;
   if (c->independent && flag <= 0 && flag != DAQP_EXIT_INFEASIBLE) {
-    /* The solver gave up from its warm start, so try a cold start. */
+    /* The solver failed from the active set of the last tick, so start without an active set. */
     flag = ip_solve_warm(c);
   }
   if (flag <= 0 && !ip_relax(c)) {
@@ -161,7 +161,7 @@ int ip_reset(ip_context *c, const double q[IP_NQ], const double v[IP_NV], ip_com
   for (i = 0; i < IP_NV; ++i) {
     c->damping[i] = 10.0 * c->m.M[i * (IP_NV + 1)];
   }
-  /* If the first tick fails, it repeats a command that balances gravity. */
+  /* If the first tick fails, it repeats this command, which balances gravity. */
   for (i = 0; i < IP_CONTROLS; ++i) {
     const double *h = c->m.h;
     const double force = i < IP_ROTORS ? ip_dot(ip_inverse + i * IP_BASE, h, IP_BASE) : h[IP_BASE + i - IP_ROTORS];

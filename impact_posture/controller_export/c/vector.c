@@ -1,7 +1,7 @@
 /* Loops over vectors. */
 
-/* A vector of two doubles, which one instruction adds or multiplies, if the compiler supports this.  The vectors are
- * explicit, because a compiler may not reorder a sum. */
+/* Two doubles that one instruction adds or multiplies.  Explicit vectors are necessary, because a compiler may not
+ * change the order of a sum. */
 #if defined(__GNUC__)
 typedef double ip_pair __attribute__((vector_size(16), aligned(8), may_alias));
 #define IP_PAIR(p) (*(const ip_pair *)(p))
@@ -83,7 +83,7 @@ static inline void ip_add(double *restrict out, double s, const double *restrict
   }
 }
 
-/* out = sum of a[k step] x[k stride ...] over k, of n numbers each. */
+/* out = sum over k of a[k step] times the n numbers from x[k stride] on. */
 static inline void ip_combine(double *restrict out, int n, const double *a, int step, const double *x, int stride, int count)
 {
   int i = 0, k;
