@@ -1,1 +1,1 @@
-"""The world in which controllers are compared: a robot in MuJoCo, what it touches, its rotors, motors and sensors."""
+"""Simulation of controllers in a world: a robot in MuJoCo, its surroundings, rotors, motors and sensors."""

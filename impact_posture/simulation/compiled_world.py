@@ -1,4 +1,4 @@
-"""Simulation loop in C, which calls MuJoCo and a controller in C in every tick."""
+"""Simulation loop in C, which calls MuJoCo and the exported C controller in every tick."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Ticks(NamedTuple):
     Attributes:
         trace: True states after the ticks.
         rotor_speed: Rotor commands, shape (n, rotors).
-        level: Levels of the term that prepares for the impact, shape (n,).
+        level: Activation levels of the controller's preparation for an impact, 0 to 1, shape (n,).
         status: Status numbers of the controller, shape (n,).
     """
 
@@ -81,7 +81,7 @@ class CompiledWorld:
                 setattr(self._struct, name, self._arrays[name].ctypes.data)
 
     def take(self, n: int, lead: Callable[[float], None]) -> Ticks:
-        """Run n ticks, or fewer if the state diverges.  ``lead`` moves the targets for a tick at a given time, s.
+        """Run n ticks, or fewer if the state diverges.  ``lead(t)`` sets the task targets for the tick at time t, s.
 
         Raises:
             InputError: A command is not finite, or the torque of a joint without limit is too large.
@@ -125,7 +125,7 @@ def compiled_world(world: World, tick: CompiledTick | None, count: int) -> Compi
 
 @cache
 def _members() -> dict[str, str]:
-    """Return the members of the C struct in their order, as a map from name to type."""
+    """Return member name → type of the C struct, in the order of the members."""
     struct = re.sub(r"/\*.*?\*/", "", _source(), flags=re.DOTALL).partition("typedef struct {")[2].partition("}")[0]
     members = {}
     for declaration in filter(None, map(str.strip, struct.split(";"))):
@@ -145,14 +145,14 @@ def _source() -> str:
 
 @cache
 def _functions() -> dict[str, int]:
-    """Return the addresses of the MuJoCo functions, by the name of the struct member that stores the address."""
+    """Return struct member → address of the MuJoCo function that the member points to."""
     library = ctypes.CDLL(str(next(Path(import_mujoco().__file__).parent.glob("libmujoco.*"))))
     names = {"step1": library.mj_step1, "step2": library.mj_step2, "apply": library.mj_applyFT}
     return {name: ctypes.cast(function, ctypes.c_void_p).value or 0 for name, function in names.items()}
 
 
 def _library() -> ctypes.CDLL | None:
-    """Load the compiled loop, which is built once and cached.  Return ``None`` if the MuJoCo headers are missing."""
+    """Load the loop; build it first if it is not in the cache.  Return ``None`` if the MuJoCo headers are missing."""
     headers = Path(import_mujoco().__file__).parent / "include"
     if not (headers / "mujoco" / "mujoco.h").is_file():
         return None

@@ -21,7 +21,7 @@ class Gains(StrictTable):
     Attributes:
         kp: Stiffness, 1/s², one number for all rows of the task or one number per row.
         kd: Damping, 1/s; ``None`` for critical damping, ``2√kp``.
-        weight: Weight of the task in the cost.  A task that is a strict level does not use it.
+        weight: Weight of the task in the cost; unused for a strict level.
     """
 
     kp: OneOrEach
@@ -48,8 +48,7 @@ class RobustTerm(StrictTable):
     """Impact-robust term of the posture task.
 
     Attributes:
-        gain: K of the term, 1/s².  The term is scaled by the curvature of the objective, so K is comparable with
-            ``kp`` of the posture.
+        gain: K of the term, 1/s².  The curvature of the objective scales the term, so K is a stiffness like ``kp``.
         ramp: Time in which the term is switched on gradually, s.
         fade: Two distances from a position limit, rad (m).  The term decreases to zero from the larger distance to
             the smaller one.
@@ -81,9 +80,7 @@ class StanceGains(StrictTable):
 @checked
 @dataclass(frozen=True)
 class Control(StrictTable):
-    """Gains of a scenario, which are the same for all its controllers.
-
-    For an optional task, ``None`` means that the controllers do not have this task.
+    """Gains of a scenario, which are the same for all controllers.  ``None`` for a task means that it does not exist.
 
     Attributes:
         posture: Gains of the posture task.
@@ -91,8 +88,8 @@ class Control(StrictTable):
         period: Duration of a tick, s, at most an hour.
         tilt: Gains of the task that keeps the base level (first priority).
         end_effector: Gains of the end effector task (second priority); the rows of the position come first.
-        apparent_mass: Mass M_d in the term ``F̂/M_d`` of the end effector task, kg; ``None`` for a task that does not
-            use the measured force.
+        apparent_mass: Mass M_d, kg.  A measured force F̂ adds ``F̂/M_d`` to the acceleration of the end effector task;
+            with ``None``, the task ignores the force.
         center_of_mass: Gains of the center of mass task.
         base: Gains of the base orientation task.
         footing: Contact constraints of a standing robot; ``None`` for a robot that does not stand.

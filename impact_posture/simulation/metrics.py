@@ -36,11 +36,11 @@ class Metrics:
         saturation_rotors: Like ``saturation_inside``, but only for rotors, s.
         relaxed_ticks: Number of ticks in which the controller relaxed a level.
         failed_ticks: Number of ticks in which the controller repeated the last command.
-        slip: Sliding distance of the shape (for pushes, of the fastest foot) within the impact windows, m.
+        slip: Distance that the shape (for pushes, the fastest foot) slides within the impact windows, m.
         stops: Joints that reached a position limit within the impact windows and did not start at this limit.
         contacts: Number of contacts (or pushes) that happened.
         contacts_asked: Number of contacts (or pushes) that the scenario requests.
-        rested: True if the robot was at rest before the push or throw, and for contacts.
+        rested: Whether the robot was at rest before the push or throw; true for contacts.
     """
 
     q_total_impact: float
@@ -135,7 +135,7 @@ def before(series: Series, window: Window) -> int:
 
 
 def jump(setup: Setup, series: Series, window: Window) -> float:
-    """Return the largest ``‖ν(t) − ν⁻‖`` within :data:`JUMP` after the begin of a window.
+    """Return the largest ``‖ν(t) − ν⁻‖`` within :data:`JUMP` after the start of a window.
 
     For pushes, return the largest ``‖ν‖`` in the window.
     """
@@ -143,7 +143,7 @@ def jump(setup: Setup, series: Series, window: Window) -> float:
 
 
 def _peak(setup: Setup, series: Series, window: Window, end: float) -> float:
-    """Return the largest ``‖ν(t) − ν⁻‖``, or for pushes ``‖ν‖``, from the begin of a window until ``end``."""
+    """Return the largest ``‖ν(t) − ν⁻‖``, or for pushes ``‖ν‖``, from the start of a window until ``end``."""
     after = series.v[series.slice(window.begin, end)]
     if not setup.scenario.push:
         after = after - series.v[before(series, window)]

@@ -28,9 +28,9 @@ SHARE = 0.8
 # moves half as far, and its objective is 1 % larger.  The humanoid thus avoids postures in which its controller loads
 # the legs unevenly.
 _NEARNESS = 0.005
-# Margins in the order of preference.  Smaller margins follow, because large ones are not feasible from every start.
-# First number: distance from the joint stops, rad (m), so that no joint rests on its stop.  Second number: distance
-# of the center of mass from the edges of the support polygon, m, so that an impact does not tip the robot.
+# Margins, the largest first, because large margins are not feasible from every start.  The first number is the
+# distance from the joint stops, rad (m), so that no joint rests on its stop.  The second number is the distance of
+# the center of mass from the edges of the support polygon, m, so that an impact does not tip the robot.
 _MARGINS = ((0.1, 0.05), (0.0, 0.05), (0.0, 0.025), (0.0, 0.0))
 
 
@@ -43,7 +43,7 @@ class OfflinePosture:
         objective: Objective at the optimal posture.
         initial: Objective at the start posture after its projection onto the constraints.
         distance: Distance of the optimal posture from the projected start posture, rad (m).
-        note: Requirement that was dropped and the reason; empty if all requirements are satisfied.
+        note: Requirement that the posture does not satisfy, and the reason; empty if all are satisfied.
     """
 
     solution: PostureSolution
@@ -68,20 +68,24 @@ def offline_posture(
 ) -> OfflinePosture:
     """Optimize the posture for the impact of a scenario.
 
-    The constraints are the same as in ``impact-posture optimize``.  The robot must not collide with itself, the
-    surface or the ground.  Holding the posture needs at most :data:`SHARE` of the limits of motors and rotors.  The
-    end effector is at the surface, in the directions that its task controls.  If ``at_contact`` is false, the end
-    effector stays at its start.  The base of a flying robot stays level.  The feet of a standing robot stay in place,
-    and its center of mass is above the feet.  The limit for the tilt of its base is the same as in the reference
-    flow.  If no posture without collisions is found, the result is the best posture with collisions, and its ``note``
-    says so.
+    The result satisfies these constraints:
+
+    - The robot does not collide with itself, the surface or the ground.
+    - Motors and rotors need at most :data:`SHARE` of their limits to hold the posture.
+    - The end effector is at the surface, in the directions that its task controls.  If ``at_contact`` is false, the
+      end effector stays at its start.
+    - The base of a flying robot stays level.
+    - The feet of a standing robot stay in place.  The center of mass is above the feet, and the base tilts at most as
+      far as the reference flow allows.
+
+    If every posture that the search reaches collides, the result is the best of these postures with a ``note``.
 
     Raises:
         Infeasible, SolverFailed: As in :func:`impact_posture.posture.search.multistart.solve`.
     """
     tell("looking for the offline posture")
     wanted, note = scenario_requirements(setup, objective, at_contact=at_contact), ""
-    # A robot that does not stand has no support polygon, so its margin of the center of mass is zero.
+    # A robot that does not stand has no support polygon, so the second margin is zero.
     margins = dict.fromkeys((stops, edges if wanted.com_over_feet else 0.0) for stops, edges in _MARGINS)
     attempts = [(collision, *margin) for collision in (True, False) for margin in margins]
     for collision, stops, edges in attempts:

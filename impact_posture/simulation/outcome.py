@@ -1,4 +1,4 @@
-"""Outcome of a run: completed, or the bounds of the scenario that the run violated."""
+"""Outcome of a run: completed, or the bound of the scenario that the run violated."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Outcome = Literal["completed", "lost contact", "control lost", "fell"]
 OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)
 # Only every 25th tick is checked for links behind a surface.
 _EVERY = 25
-# If a joint origin is deeper behind a surface than this, the cause is not the compression of a contact, m.
+# A joint origin that is deeper behind a surface, m, has moved through it.  Compression of a contact is less deep.
 _DEEP = 0.02
 
 
@@ -94,7 +94,7 @@ def _falls(setup: Setup, series: Series) -> list[Event]:
     }
     for name, n in built.normals.items():
         if (setup.q[:3] - built.points[name]) @ n < bounds.clearance:
-            # If the base starts behind the plane, the bound has no meaning, because real surfaces end somewhere.
+            # Ignore surfaces that the base is behind at the start, because real surfaces do not extend that far.
             continue
         words = f"the base came closer than {bounds.clearance:g} m to" if bounds.clearance else "the base went into"
         broken[f"{words} the surface '{name}'"] = (places - built.points[name]) @ n < bounds.clearance

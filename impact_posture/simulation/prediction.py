@@ -26,15 +26,15 @@ class Prediction:
         G: ``nᵀBn`` just before the impact, with the mobility ``B = J M⁻¹Jᵀ``, 1/kg.
         V: ``H/G²``: squared jump per squared approach speed without friction.
         S: Squared jump per squared approach speed if the contact sticks; ``None`` if S is undefined.
-        approach: Approach speed ``v`` of robot and surface (or ball) just before the impact, m/s.
-            For pushes, the impulse of the push, N·s.
+        approach: Approach speed ``v`` of robot and surface (or ball) just before the impact, m/s.  For pushes, the
+            impulse of the push, N·s.
         frictionless: Predicted jump without friction and rebound, ``v √V``.  For pushes, ``√H`` times the impulse:
             the velocity of a robot without controller at the end of the push.
         sticking: Predicted jump if the contact sticks, ``v √S``, for an approach along the normal; ``None`` for
             pushes and if S is undefined.
         coulomb: Predicted jump with the friction of the surface, ``v √C``, for an approach along the normal;
             ``None`` for pushes.
-        measured: Measured jump, as in :class:`~impact_posture.simulation.metrics.Metrics`.
+        measured: Measured jump (``peak_jump`` in :class:`~impact_posture.simulation.metrics.Metrics`).
         ratio: ``measured`` divided by ``coulomb`` (for pushes, by ``frictionless``); ``None`` if the divisor is
             almost zero.
     """

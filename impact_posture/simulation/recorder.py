@@ -1,4 +1,4 @@
-"""Recorder of the states and commands of a run."""
+"""Record the states and commands of a run."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from impact_posture.tsid.controller import Command
 
 # The metric is evaluated only at every tenth tick, because only figures need it.
 _EVERY = 10
-# After this number of ticks, the true states are read from the world.  So its log of contacts stays short.
+# After this number of ticks, the true states are read from the world, so that its log of contacts stays short.
 _BLOCK = 1000
 _NUMBERS = {status: k for k, status in enumerate(STATUSES)}
 
 
 def feet_of(setup: Setup) -> tuple[str, ...]:
-    """Return the frames of the shapes that must stay on the ground; empty if the robot does not stand."""
+    """Return the frames of the standing feet; empty if the robot does not stand."""
     scenario, robot = setup.scenario, setup.robot
     if scenario.control.footing is None:
         return ()
@@ -32,7 +32,7 @@ def feet_of(setup: Setup) -> tuple[str, ...]:
 
 
 class Recorder:
-    """Recorder of a run with one row for each tick.  ``metric`` computes H at a posture q."""
+    """Record each tick of a run.  ``metric`` is the function q → H."""
 
     def __init__(self, setup: Setup, metric: Callable[[Array], float]) -> None:
         self._setup, self._metric, self._world = setup, metric, setup.world
@@ -42,8 +42,8 @@ class Recorder:
         feet = feet_of(setup)
         self._feet = [k for k, frame in enumerate(shapes) if frame in feet]
         self._rows: list[tuple[Array, float, int, float]] = []
-        # Completed blocks of ticks: rotor commands, levels, status numbers and distances in ``_columns``, true states
-        # in ``_traces``.
+        # For each block of recorded ticks, ``_columns`` contains rotor commands, levels, status numbers and
+        # distances, and ``_traces`` contains the true states.
         self._columns: list[tuple[Array, ...]] = []
         self._traces: list[Trace] = []
         self._push = (np.zeros(3), np.inf, -np.inf)
@@ -79,7 +79,7 @@ class Recorder:
         """Return the time of the first touch within ``[begin, end)``, s; ``None`` if there is no touch."""
         trace, k = self._trace(), self._shape
         assert k is not None  # noqa: S101 (a push has no shape)
-        # During a lasting contact, ``began`` has a new time in every tick, so only the first of these ticks is used.
+        # During a contact, ``began`` has a new time in every tick, so only the first tick of the contact is used.
         before = np.concatenate([[False], trace.touching[:-1, k]])
         touches = trace.began[~before, k]
         touches = touches[(begin <= touches) & (touches < end)]

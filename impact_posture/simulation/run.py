@@ -23,9 +23,9 @@ from impact_posture.system.arrays import Array
 from impact_posture.system.processes import fork_call
 from impact_posture.system.progress import tell
 
-# Controllers begin to prepare for the impact at this time, after the initial transients of sensors and motors, s.
+# Controllers start to prepare for the impact at this time, s.  Transients of sensors and motors are over by then.
 BRACE = 0.1
-# Number of ticks between two progress messages, in Python and in C.  A call of the C loop takes as long as ten ticks.
+# Number of ticks between two progress messages of loops in Python and in C.
 _TELL, _TELL_IN_C = 100, 1000
 # Maximum number of ticks in a run, nearly three hours at 1 kHz.  A tick of an arm needs about a kilobyte of memory.
 _MOST = 10**7
@@ -39,11 +39,11 @@ class Run:
 
     Attributes:
         series: Time series of all ticks.
-        windows: First an impact window for each contact or push, then the dwell and recovery windows.
+        windows: Impact windows of all contacts or pushes, then the dwell and recovery windows.
         sign: Sign of the push or throw; 1 for contacts.
-        waited: Begin of the impact window of the push or throw, s; NaN for contacts.
-        rested: True if the robot was at rest before the push.  If the robot does not come to rest, the push starts
-            after the ``patience`` of the scenario, and the metrics contain the motion before the push.
+        waited: Start of the impact window of the push or throw, s; NaN for contacts.
+        rested: Whether the robot was at rest before the push.  If the robot does not come to rest, the push starts
+            after the time ``patience`` of the scenario, and the metrics contain the motion before the push.
         away: Time at which the state diverged and the run ended, s; ``None`` if the state did not diverge.
     """
 
@@ -55,15 +55,13 @@ class Run:
     away: float | None = None
 
     def of(self, kind: str) -> tuple[Window, ...]:
-        """Return the windows of one kind: ``impact``, ``dwell`` or ``recovery``."""
+        """Return the windows with this ``kind``: ``impact``, ``dwell`` or ``recovery``."""
         return tuple(window for window in self.windows if window.kind == kind)
 
 
 def run(factory: ControllerFactory, controller: str, *, seed: int = 0, mode: Mode = "live", gain: float | None = None,
         only: int | None = None) -> tuple[Run, ...]:  # fmt: skip
-    """Run a controller through a scenario.
-
-    For contacts, there is one run.  For a push or throw, there is one run for each sign.
+    """Run a controller through a scenario: one run for contacts, or one run for each sign of a push or throw.
 
     Args:
         factory: Factory of the scenario's controllers.
@@ -92,7 +90,7 @@ def run(factory: ControllerFactory, controller: str, *, seed: int = 0, mode: Mod
 
 
 class _Loop:
-    """Loop of controller and world.  The loop runs in C if controller and world can run in C."""
+    """Loop of controller and world, in C if both have C code, otherwise in Python."""
 
     def __init__(self, factory: ControllerFactory, driver: Driver, seed: int) -> None:
         setup = factory.setup
@@ -125,7 +123,7 @@ class _Loop:
             new = take(count, reference)
             speeds = np.concatenate([speeds, new])
             if new.size < count:
-                # A run with fewer than two ticks cannot be drawn, so raise the error.
+                # Figures need at least two ticks, so raise the error.
                 if self.recorder.ticks < 2:
                     raise SimulationDiverged(self.t, where=self.setup.robot.name)
                 self.away = self.t
@@ -163,7 +161,7 @@ class _Loop:
         assert self.compiled is not None  # noqa: S101 (the caller has checked it)
         distances: list[float] = []
         levels: list[float] = []
-        # If a driver overrides `level`, the level of a tick is known before the tick and is read here.
+        # If a driver overrides `level`, its level does not come from the C controller, so read it before each tick.
         overrides = type(self.driver).level is not Driver.level
 
         def lead(t: float) -> None:
@@ -183,13 +181,13 @@ class _Loop:
 def _contacts(loop: _Loop, task: RepeatedContacts, mode: Mode) -> Run:
     driver, reference = loop.driver, Reference(task, loop.setup.gap)
     loop.check_length(reference.total)
-    # The reference reaches the surface at this time after the start of the approach, and brakes behind the surface.
+    # Time from the start of an approach until the reference reaches the surface.
     crossing = reference.inward - 2 * task.beyond / task.speed
     starts = [reference.start(k) for k in range(task.count)]
     events = [(BRACE, driver.brace)]
     if mode == "held":
         events.append((max(BRACE, starts[0] - 2 * loop.ramp), driver.hold))
-    # At the begin of each approach, tell the controller the expected time of the impact.
+    # At the start of each approach, tell the controller the expected time of the impact.
     events += [(start, partial(driver.expect, start + crossing)) for start in starts]
     events.sort(key=lambda event: event[0])
     left = round(reference.total / loop.period)
@@ -251,7 +249,7 @@ def _settle(loop: _Loop, task: SinglePush | Throw, least: float, brace: list[Cal
     """Run until time ``least`` (s), and until the robot has been at rest for the time ``task.still``.
 
     ``brace`` contains the callback that prepares the controller.  Return false if the robot does not come to rest
-    within the patience.
+    within ``task.patience``.
     """
     still, end = 0.0, max(least, loop.t) + task.patience
     while loop.t < least - SAME or still < task.still - SAME:
@@ -259,7 +257,7 @@ def _settle(loop: _Loop, task: SinglePush | Throw, least: float, brace: list[Cal
             return False
         if brace and loop.t >= BRACE - SAME:
             brace.pop()()
-        # Before the earliest of these times, no decision is needed, so run until this time at once.
+        # Nothing can change before the earliest of these times, so run all ticks until then in one call.
         waits = [max(least, loop.t + task.still - still), end, *([BRACE] if brace else [])]
         for speed in loop.ticks(min(map(loop.until, waits))):
             still = still + loop.period if speed < task.quiet else 0.0

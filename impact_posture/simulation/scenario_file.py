@@ -29,9 +29,9 @@ SHIPPED = Path(__file__).parent / "scenarios"
 @checked
 @dataclass(frozen=True)
 class RepeatedContacts(StrictTable):
-    """Contacts of the end effector with a surface: it moves into the surface and back, several times.
+    """Repeated contacts: the end effector moves into a surface and back, several times.
 
-    The reference starts at the shape.  It moves against the normal to a point at the distance ``beyond`` behind the
+    The reference of the end effector moves from the start position to a point at the distance ``beyond`` behind the
     surface, stays there, and returns (:mod:`impact_posture.simulation.controllers.contact_reference`).
 
     Attributes:
@@ -92,7 +92,7 @@ class Bounds(StrictTable):
         clearance: Minimum height of the base origin above every surface, m.
         sink: Maximum distance by which the base sinks below its start, or below its reference, m.
         lifted: Maximum time for which a supporting foot loses contact, s.
-        relaxed: Maximum share of ticks in which the controller relaxes a level.
+        relaxed: Maximum share of ticks in which the controller relaxes a strict level.
         held: Maximum time for which the controller repeats the last command, s.
     """
 
@@ -161,10 +161,7 @@ class ScenarioTable(Scene, RobotSettings):
 @checked
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Scenario(ScenarioTable):
-    """Experiment as described in its file, before the robot is loaded.
-
-    ``source`` is the path of the file, which errors mention.
-    """
+    """Experiment as described in the file ``source``, before the robot is loaded."""
 
     source: str = ""
 
@@ -182,7 +179,7 @@ class Scenario(ScenarioTable):
 
     @property
     def normal(self) -> Array:
-        """Unit normal of the surface, or direction of the push or throw, shape (3,)."""
+        """Unit normal of the surface, or unit direction of the push or throw, shape (3,)."""
         direction = self.push.force if self.push else self.throw.direction if self.throw else self.surface.normal
         return np.asarray(np.array(direction, dtype=float) / np.linalg.norm(direction))
 
@@ -193,12 +190,12 @@ class Scenario(ScenarioTable):
 
     @property
     def surface(self) -> Surface:
-        """Surface that the robot hits.  Raises an InputError if the scenario has no contacts."""
+        """Surface that the robot hits; InputError if the scenario has no contacts."""
         return next(s for s in self.surfaces if s.name == self._contacts("surface that is hit").surface)
 
     @property
     def shape(self) -> Shape:
-        """Shape that hits the surface, or at which the ball is thrown.  Raises an InputError for a push."""
+        """Shape that hits the surface, or at which the ball is thrown; InputError for a push."""
         frame = self._contacts("shape that hits").frame if self.throw is None else self.throw.frame
         return next(s for s in self.shapes if s.frame == frame)
 
@@ -234,7 +231,7 @@ def read_scenario(scenario: str | Path) -> Scenario:
     """
     path = scenario_path(scenario)
     data = read_toml(path)
-    # Check the schema first, because a file with another schema may have other keys.
+    # Check the schema first, because files with other schemas can have other keys.
     schema = data.get("schema", SCHEMA)
     if schema != SCHEMA:
         raise SpecError(f"schema '{shown(schema)}'", where=str(path), hint=f'write schema = "{SCHEMA}"')

@@ -43,10 +43,7 @@ def scenario_objective(setup: Setup, kind: ObjectiveKind = "impulse", *, free: b
 
 
 def interpreted(objective: WorstCaseObjective) -> Gradient:
-    """Return the function ``q → (objective, gradient)``, evaluated by the CasADi interpreter.
-
-    The interpreter needs no compiler, but it is slower than C.
-    """
+    """Return the function ``q → (objective, gradient)``, evaluated by the CasADi interpreter (slower than C)."""
     function, normal = objective.gradient_fun(), np.array(objective.contact.normal, dtype=float)
 
     def call(q: Array) -> tuple[float, Array]:
@@ -59,10 +56,10 @@ def interpreted(objective: WorstCaseObjective) -> Gradient:
 
 
 def compiled(objective: WorstCaseObjective) -> Gradient:
-    """Return the function ``q → (objective, gradient)`` from the C export, which is built once and cached.
+    """Return the function ``q → (objective, gradient)`` from the cached C export; build the export if it is missing.
 
     Raises:
-        CompilerError: No compiler exists, the compiler failed, or the library computes other numbers than CasADi.
+        CompilerError: There is no compiler, the compiler failed, or the results of the library differ from CasADi.
         OutputError: The cache folder cannot be written, or other users can write it.
         SpecError: The library cannot be loaded, for example because another machine built it.
     """

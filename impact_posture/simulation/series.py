@@ -19,7 +19,7 @@ Flags = NDArray[np.bool_]
 STATUSES: tuple[Status, ...] = tuple(Status)
 # Times that differ by less than this are treated as equal, because sums of time steps have rounding errors, s.
 SAME = 1e-9
-# Maximum duration of the recovery window, which starts with the impact and can contain a delayed motion, s.
+# Maximum duration of the recovery window, s.  It starts with the impact and is long enough for delayed motions.
 RECOVERY = 1.0
 
 
@@ -32,9 +32,9 @@ class Window:
             the reference leaves the surface.  A recovery window ends after :data:`RECOVERY`, at the next approach, or
             at the end of the run.
         contact: Number of the contact or push, starting at 0.
-        begin: Time at the begin of the window, s.
-        end: Time at the end of the window, s.
-        touched: True if the impact happened.  If it did not, the window begins at the expected time.
+        begin: Start of the window, s.
+        end: End of the window, s.
+        touched: Whether the impact happened.  If it did not, the window begins at the expected time of the impact.
     """
 
     kind: str
@@ -61,7 +61,7 @@ class Series:
         touching: Number of shapes in contact, shape (n,).
         feet: Whether each supporting foot is in contact, shape (n, feet).
         objective: H of the impact, shape (n,); NaN in ticks in which H was not evaluated.
-        level: Level of the term that prepares for the impact, 0 to 1, shape (n,).
+        level: Activation level of the controller's preparation for an impact, 0 to 1, shape (n,).
         status: Status of the controller as an index into :data:`STATUSES`, shape (n,).
         at_stop: Whether each joint is at a position limit, shape (n, nv).
         reference: Distance of the reference along its approach, m, shape (n,); zero for pushes.
@@ -86,12 +86,12 @@ class Series:
 
     @property
     def relaxed(self) -> Flags:
-        """True for ticks in which the controller relaxed a level, shape (n,)."""
+        """Whether the controller relaxed a strict level, for each tick, shape (n,)."""
         return np.asarray(self.status == STATUSES.index(Status.RELAXED))
 
     @property
     def held(self) -> Flags:
-        """True for ticks in which the controller repeated the last command, shape (n,)."""
+        """Whether the controller repeated the last command, for each tick, shape (n,)."""
         return np.asarray(~self.relaxed & (self.status != STATUSES.index(Status.SOLVED)))
 
     def slice(self, begin: float, end: float) -> slice:

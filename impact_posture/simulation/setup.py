@@ -16,7 +16,7 @@ from impact_posture.simulation.world.world import World, build_world
 from impact_posture.system.arrays import Array
 from impact_posture.system.progress import tell
 
-# Keys of a scenario.  The ``where`` of an error may be one of these keys.
+# Keys of a scenario file.
 _KEYS = {field.name for field in fields(ScenarioTable)}
 
 
@@ -38,7 +38,7 @@ class Setup:
 
     @property
     def gap(self) -> float:
-        """Distance between shape and surface at the start, m.  Raises an InputError without contacts."""
+        """Distance between shape and surface at the start, m; InputError if the scenario has no contacts."""
         return self.world.built.gaps[self.scenario.surface.name, self.scenario.shape.frame]
 
 
@@ -71,8 +71,8 @@ def naming_keys(scenario: Scenario) -> Iterator[None]:
         if {where.partition(" ")[0], where.rpartition(" ")[2]} & _KEYS and scenario.source:
             where = f"{scenario.source}, {where}"
         elif where in ("", "problem") or (isinstance(error, NameNotFound) and "." not in where):
-            # The scenario names a frame or joint that the robot does not have.  If the place of the error contains a
-            # dot, the place is a key of robot.toml and stays.
+            # The scenario names a frame or joint that the robot does not have.  Keep a ``where`` with a dot, because
+            # it is a key of robot.toml.
             where = scenario.source
         what, hint = (
             text.replace("`contact_pose`", "control.end_effector.pose").replace("`", "")

@@ -33,8 +33,7 @@ def export_world(setup: Setup, out: Path, *, force: bool = False) -> None:
 
     Raises:
         InputError: The scenario throws a ball, or a joint is neither revolute, prismatic nor a floating base.
-        OutputError: The folder exists and ``force`` is false, or the folder contains files that are not from this
-            export, or it cannot be written.
+        OutputError: The folder exists and ``force`` is false, contains other files, or cannot be written.
     """
     mjcf = setup.world.built.mjcf
     model = mjcf.compile()

@@ -14,7 +14,7 @@
 /* If the square of an angle is below this value, power series replace sine and cosine. */
 #define SMALL 1e-8
 
-/* compiled_world.py parses this declaration, and fills in the members. */
+/* compiled_world.py reads the names and types of the members from this text, and sets the members. */
 typedef struct {
   const mjModel *model;
   mjData *data;
@@ -31,14 +31,14 @@ typedef struct {
   /* The robot: indices of q and v in qpos and qvel, and the true state. */
   int nq, nv, nqpos, floating, joints, *q_at, *v_at;
   double *true_q, *true_v, *effort, *torque, runaway;
-  /* 1 if the last command was invalid, with the same check as CommandLimits.within. */
+  /* 1 if the last command was invalid.  The check is the same as in CommandLimits.within. */
   int refused;
 
   /* Time: number of physics steps since the reset, number of physics steps in a tick, and time step in s. */
   int steps, count;
   double timestep;
 
-  /* The propellers: speeds and angles, relative changes of a speed in the steps of a tick, limits, and vibration. */
+  /* The propellers: speeds and angles, relative changes of a speed after each step of a tick, limits, vibration. */
   int rotors, vibrates;
   double *speeds, *phases, *up, *down, lowest, highest, thrust, *along, *across, *inverse;
 
@@ -46,7 +46,7 @@ typedef struct {
   int noises, noisy_q, noisy_v, noisy_force, felt;
   double resolution, share, *filtered;
 
-  /* The shapes: the shape of each geom, forces of the last step, and accumulated quantities. */
+  /* The shapes: the shape of each geom, forces in the last step, and quantities accumulated over steps. */
   int shapes, *shape_of;
   double *now, *normal, *impulse, *peak, *began;
 
@@ -124,7 +124,7 @@ static void state(const world *w, double *q, double *v)
   }
 }
 
-/* Move the pose of a base (xyz and quaternion) with the constant twist d, in base axes, for a unit of time. */
+/* Move the pose of a base (xyz and quaternion) by the twist d, in base axes, for one second. */
 static void move_base(double *q, const double *d)
 {
   const double *p = d, *r = d + 3;
@@ -172,7 +172,7 @@ static void vibrate(const world *w, double *v)
   }
 }
 
-/* Compute the sensor readings from the true state and the noise of one reading. */
+/* Compute the sensor readings from the true state and the noise of this reading. */
 static void measure(const world *w, const double *noise)
 {
   double *q = w->q, *v = w->v;
@@ -186,7 +186,7 @@ static void measure(const world *w, const double *noise)
     if (w->floating) {
       move_base(q, noise);
     }
-    /* Each joint has one value.  A base has 7 values in q and 6 in v, so the indices of joints differ by one. */
+    /* Each joint has one value.  A base has 7 values in q and 6 in v, so a joint has the index k + 1 in q. */
     for (k = 6 * w->floating; k < w->nv; ++k) {
       q[k + w->floating] += noise[k];
     }
@@ -227,7 +227,7 @@ static void push(const world *w)
   }
 }
 
-/* Compute the forces of the surfaces on the shapes in a step, and update the accumulated quantities. */
+/* Compute the forces of the surfaces on the shapes in the last step, and update the accumulated quantities. */
 static void contacts(const world *w)
 {
   const double step = w->timestep, began = w->data->time - step;
@@ -261,7 +261,7 @@ static void contacts(const world *w)
   }
 }
 
-/* Compute the largest tangential speed of the contact points of each shape that a surface pushes. */
+/* Compute, for each shape that a surface pushes, the largest tangential speed of the contact points. */
 static void slips(const world *w, double *slip)
 {
   double arm[3], velocity[3], normal;
@@ -340,7 +340,7 @@ static int refuses(const world *w)
   return 0;
 }
 
-/* Run ticks.  Return the number of ticks before the state diverged or a command was invalid. */
+/* Run at most `ticks` ticks.  Return how many ticks ran before the state diverged or a command was invalid. */
 int world_ticks(world *w, int ticks)
 {
   const int targets = w->targets;

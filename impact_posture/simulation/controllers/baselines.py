@@ -22,11 +22,11 @@ from impact_posture.tsid.tasks.impact_robust import ImpactRobustPosture, curvatu
 def spring_of_term(robot: Robot, gradient: Gradient, q: Array, strength: float) -> Array:
     """Return ``[K ∇²H(q)/λ]₊``, the stiffness of the impact-robust term at ``q``, 1/s², shape (nv, nv).
 
-    ``gradient`` is ``q → (H, ∇H)``, ``strength`` is ``K/λ``, and ``q``, shape (nq,), is the resting posture with the
-    term.  A posture task with this additional stiffness is as stiff as the term, but does not change the posture.  So
-    the difference between the two controllers is the effect of the posture.  ``∇²H`` is symmetrized.  The entries of
-    a floating base are zero, because other tasks control the base.  Negative eigenvalues are set to zero, because
-    they would destabilize the robot.
+    ``gradient`` is ``q → (H, ∇H)`` and ``strength`` is ``K/λ``.  ``q``, shape (nq,), is the posture in which the
+    robot rests with the impact-robust term.  A posture task with this additional stiffness is as stiff as the term,
+    but does not change the posture.  A comparison of both controllers therefore shows the effect of the posture
+    alone.  ``∇²H`` is symmetrized.  The entries of a floating base are zero, because other tasks control the base.
+    Negative eigenvalues are set to zero, because they would destabilize the robot.
     """
     added = strength * curvature(gradient, robot.model, q, np.eye(robot.nv))
     if robot.floating:
@@ -40,9 +40,8 @@ def resting_posture(driver: Driver, seconds: float, *, ahead: float = 0.0) -> Ar
     """Return the posture in which a driver comes to rest after :meth:`Driver.brace`, shape (nq,).
 
     The robot executes the commanded acceleration exactly, without physics engine, sensors and motors.  The motion
-    ends when the level of the driver is 1 and ``‖ν‖`` has been below 1e-3 for 0.2 s, or after ``seconds``.  If
-    ``ahead`` is not zero, the end effector then moves ``ahead`` (m) towards the surface, and the robot comes to rest
-    again.
+    ends when :attr:`Driver.level` is 1 and ``‖ν‖`` has been below 1e-3 for 0.2 s, or after ``seconds``.  If ``ahead``
+    is not zero, the end effector then moves ``ahead`` (m) towards the surface, and the robot comes to rest again.
     """
     setup, period = driver.setup, driver.controller.period
     q, v, t = setup.q.copy(), np.zeros(setup.robot.nv), 0.0
@@ -64,10 +63,9 @@ def resting_posture(driver: Driver, seconds: float, *, ahead: float = 0.0) -> Ar
 class FlowPosture(ImpactRobustPosture):
     """Projected gradient flow of Walker 1994 as the reference of a posture task.
 
-    The velocity reference is ``ν_ref = −α k Z Zᵀ ∇H/λ``, and the posture reference ``q_des`` is its integral.  They
-    replace the impact-robust term.  The columns of ``Z`` span the motions that the other tasks leave free.
-    ``k = K/K_d`` makes the flow as fast as the impact-robust term.  The flow is bounded like this term, and it fades
-    out near joint limits like this term.
+    The velocity reference ``ν_ref = −α k Z Zᵀ ∇H/λ`` and its integral, the posture reference ``q_des``, replace the
+    impact-robust term.  The columns of ``Z`` span the motions that the other tasks leave free.  ``k = K/K_d`` makes
+    the flow as fast as the impact-robust term.  Bound and fade near joint limits are the same as for this term.
 
     Attributes:
         basis: ``Z``, shape (nv, r); ``None`` to stop the flow.
@@ -117,17 +115,17 @@ class WalkerDriver(RobustDriver):
     def hold(self) -> None:
         """Stop the flow and hold the present posture, center of mass and base orientation."""
         super().hold()
-        # If other tasks have slowed the robot, the reference is ahead, so move the reference to the robot's posture.
+        # Other tasks can slow the robot, so that the reference is ahead.  Move it to the posture of the robot.
         self.posture.move_to(self.controller.state.q, self.posture.activation.ramp)
 
 
 class ReleaseDriver(RobustDriver):
     """Impact-robust term without the nominal stiffness ``K_p``, until ``H`` no longer decreases.
 
-    Without ``K_p``, the posture moves to the optimum.  With ``K_p``, it would come to rest before the optimum.  The
-    scale of the term is the larger one of the curvatures at the start and at the offline optimum.  So the stiffness
-    of the term hardly exceeds ``K`` between these postures.  If ``H`` decreases by a share of less than :attr:`LEAST`
-    within :attr:`PATIENCE` (s), the reached posture is held.  The term must have ``spring="release"`` and an
+    Without ``K_p``, the posture moves to the optimum; with ``K_p``, it would come to rest before.  The scale ``λ`` of
+    the term is the larger of the curvatures at the start and at the offline optimum, so that the stiffness of the
+    term hardly exceeds ``K`` between these postures.  If ``H`` decreases by less than the share :attr:`LEAST` within
+    :attr:`PATIENCE` (s), the controller holds the reached posture.  The term must have ``spring="release"`` and an
     activation that is not live.
     """
 

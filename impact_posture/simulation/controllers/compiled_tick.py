@@ -1,4 +1,4 @@
-"""Controller of a driver as machine code, which is built once for each formulation."""
+"""Controller in compiled C code, which is built once for each formulation."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _QUICK = ("-O1",)
 
 
 class CompiledTick:
-    """Controller in C (``library``) that gets its targets from the tasks in Python."""
+    """Exported C controller (``library``) with the targets of the tasks in Python."""
 
     def __init__(self, controller: Controller, structure: Structure, library: CompiledController) -> None:
         self.library, self._controller, self._structure = library, controller, structure
@@ -60,8 +60,8 @@ class CompiledTick:
     def plan(self, times: Sequence[float], lead: Callable[[float], None]) -> tuple[Array, Array]:
         """Call ``lead`` for ticks at n times, and record how it changes the targets.
 
-        Return flags, shape (n, targets), which are 1 if a target changes before a tick, and the changed targets,
-        shape (n, targets, 25).
+        Return two arrays.  The first, shape (n, targets), is 1 where a target changes before a tick.  The second,
+        shape (n, targets, 25), contains the changed targets.
         """
         targets = self.library.targets
         before = {name: row.copy() for name, row in targets.items()}
@@ -83,8 +83,8 @@ class CompiledTick:
         """Send the changed targets to C.  Return the names of their tasks."""
         moved = []
         for task in self._tasks:
-            # Python changes a target by assigning a new object, so identity shows a change.  Targets that C changes
-            # stay the same object here.
+            # Python assigns a new object to change a target, so a different object means a change.  Targets that only
+            # C changes are the same objects.
             rates = task.target_velocity, task.target_acceleration
             now = (task.target, rates[0].tobytes(), rates[1].tobytes())
             sent = self._sent.get(task.name)
@@ -96,7 +96,7 @@ class CompiledTick:
 
 
 def compiled_tick(controller: Controller, structure: Structure, objective: WorstCaseObjective | None) -> CompiledTick:
-    """Return the controller as machine code, which is built once and cached.
+    """Return the controller as compiled C code from the cache; build it first if the cache does not contain it.
 
     Raises:
         InputError: The sources of DAQP are missing.
@@ -114,7 +114,7 @@ def compiled_tick(controller: Controller, structure: Structure, objective: Worst
                 raise CompilerError(
                     "the compiler wrote no library", where=str(folder), hint="set CC to another compiler"
                 )
-    # Use the given structure, because the manifest can name another robot that has the same code.
+    # Do not use names of the manifest: another robot with the same code may have written it.
     return CompiledTick(controller, structure, CompiledController.load(folder))
 
 

@@ -23,14 +23,14 @@ class ReferencePoint(NamedTuple):
 class Reference:
     """Reference trajectory of :class:`RepeatedContacts` along ``−n``, into the surface.
 
-    In the approach, the reference accelerates from rest with ``acceleration`` to ``speed`` and keeps this speed until
-    it reaches the surface.  It then brakes uniformly to rest at the distance ``beyond`` behind the surface.  After
-    the time ``dwell``, it returns to the start with the same acceleration and at most the same speed.  Then it
-    pauses.
+    During the approach, the reference accelerates from rest with ``acceleration`` to ``speed`` and keeps this speed
+    until it reaches the surface.  Behind the surface, it brakes uniformly to rest at the distance ``beyond``.  After
+    the time ``dwell``, it returns to the start with the same acceleration and at most the same speed.  Then it rests
+    for the time ``pause``.
 
     Attributes:
         inward: Duration of the approach, s.
-        cycle: Time from the begin of an approach to the begin of the next one, s.
+        cycle: Time from the start of an approach to the start of the next approach, s.
         total: Duration of the run, s.
         legs: Segments of constant acceleration, each with duration (s), acceleration (m/s²), initial distance (m) and
             initial speed (m/s).
@@ -64,7 +64,7 @@ class Reference:
         self.total = task.settle + task.count * self.cycle
 
     def start(self, contact: int) -> float:
-        """Return the time at which the approach of a contact begins, s."""
+        """Return the time at which the approach to contact number ``contact`` begins, s."""
         return float(self.task.settle + contact * self.cycle)
 
     def at(self, t: float) -> ReferencePoint:

@@ -47,24 +47,24 @@ Mode = Literal["live", "held"]
 MEANING: dict[str, str] = {
     "nominal": "TSID with the start posture",
     "robust": "its posture task with -K grad H, the paper's",
-    "robust-speed": "the same with the gradient of V, the jump per approach speed",
-    "robust-sticking": "the same with the gradient of S, the jump where the contact sticks",
-    "robust-release": "robust without the nominal spring, until the metric falls no more",
+    "robust-speed": "like robust, with the gradient of V (jump per approach speed)",
+    "robust-sticking": "like robust, with the gradient of S (jump if the contact sticks)",
+    "robust-release": "like robust, without the nominal posture stiffness until H stops decreasing",
     "robust-flow": "the posture flows to lower H before the impact, without a gain",
-    "robust-flow-sticking": "the same to lower S, for impacts at a given speed",
+    "robust-flow-sticking": "like robust-flow, to lower S, for impacts at a given speed",
     "posture": "the offline optimum as posture, no gradient",
-    "posture-sticking": "the offline optimum of S as posture, for impacts at a given speed",
-    "path": "the offline optimum, along a timed path without collisions",
+    "posture-sticking": "like posture, with the optimum of S, for impacts at a given speed",
+    "path": "like posture, but along a timed path without collisions",
     "stiff": "the start posture, as stiff as the term is where robust rests",
-    "posture-stiff": "the offline optimum, as stiff as the term is there",
-    "invariant": "nominal, feedback projected on the impact-invariant subspace around the impact",
-    "reference-spreading": "nominal, references before and after the impact, none of velocity between",
-    "impact-aware": "nominal, rates and torques after an impact limited before it",
-    "walker": "the gradient's flow as reference of the posture task",
+    "posture-stiff": "like posture, with the stiffness of the impact-robust term at the optimum",
+    "invariant": "nominal, but impulses do not affect the velocity feedback around the impact",
+    "reference-spreading": "nominal, with references before and after the impact, without velocity feedback between",
+    "impact-aware": "nominal, with a speed that keeps joint rates and torques of an impact within limits",
+    "walker": "the posture target follows the negative gradient of H",
 }
 CONTROLLERS = tuple(MEANING)
-# With this suffix, a controller gets additional stiffness, equal to the stiffness of the impact-robust term at the
-# controller's resting posture.
+# This suffix adds a stiffness to a controller.  The stiffness is the stiffness of the impact-robust term at the
+# posture in which the controller rests.
 _STIFF = "-stiff"
 _PLAIN = {
     "nominal": Driver,
@@ -72,7 +72,7 @@ _PLAIN = {
     "reference-spreading": ReferenceSpreadingDriver,
     "impact-aware": ImpactAwareDriver,
 }
-# Drivers that can use a controller in C.
+# Driver classes that can use a controller in C.
 _IN_C = (Driver, RobustDriver, FlowDriver, PostureDriver)
 _KINDS: dict[str, ObjectiveKind] = {
     "robust-speed": "speed",
@@ -125,16 +125,13 @@ class ControllerFactory:
     _offline: dict[tuple[ObjectiveKind, bool], OfflinePosture] = field(default_factory=dict)
 
     def objective(self, kind: ObjectiveKind = "impulse") -> WorstCaseObjective:
-        """Return the objective of a kind for the impact of the scenario."""
+        """Return the objective of type ``kind`` (``impulse``, ``speed``, …) for the impact of the scenario."""
         if kind not in self._objectives:
             self._objectives[kind] = scenario_objective(self.setup, kind, free=self.free)
         return self._objectives[kind]
 
     def gradient(self, kind: ObjectiveKind = "impulse") -> Gradient:
-        """Return the gradient of the objective of a kind.
-
-        If the gradient cannot be compiled, it is interpreted, and a warning is added.
-        """
+        """Return the gradient of :meth:`objective`.  If it cannot be compiled, interpret it and add a warning."""
         if kind not in self._gradients:
             try:
                 self._gradients[kind] = self.gradient_of(self.objective(kind)), ()
@@ -159,7 +156,7 @@ class ControllerFactory:
         return self._optimum(name) if name in _OFFLINE else None
 
     def _optimum(self, name: str) -> OfflinePosture:
-        # For the controller ``path``, the end effector must stay at its start, so a separate optimum is computed.
+        # With the controller ``path``, the end effector must stay at its start, so the optimum is another one.
         kind, at_contact = _KINDS.get(name, "impulse"), name != "path"
         if (kind, at_contact) not in self._offline:
             self._offline[kind, at_contact] = self.offline_of(
@@ -178,9 +175,9 @@ class ControllerFactory:
     def driver(self, name: str, mode: Mode = "live", gain: float | None = None) -> Driver:
         """Build the driver of a controller.
 
-        Other installed packages can add controllers by entry points of the group :data:`GROUP`.  Such an entry point
-        is a function that gets this factory, the mode and the gain, and returns the driver.  For the arguments see
-        :func:`impact_posture.simulation.run.run`.
+        Other installed packages can add controllers by entry points of the group :data:`GROUP`.  An entry point is a
+        function that gets this factory, the mode and the gain, and returns the driver.  The arguments are the same as
+        in :func:`impact_posture.simulation.run.run`.
 
         Raises:
             ControllerNotFound: The controller is unknown.
@@ -228,9 +225,10 @@ class ControllerFactory:
         return driver(setup, task(robot, gradient, K=K, fade=term.fade, activation=activation, **options))
 
     def _compiled(self, driver: Driver, name: str) -> CompiledTick | None:
-        """Return the controller of a driver as machine code, or ``None`` if it must run in Python.
+        """Return the compiled controller of a driver, or ``None`` if the controller must run in Python.
 
-        Only the drivers in :data:`_IN_C` can use machine code.  Other drivers read the state of their controller.
+        Only the driver classes in :data:`_IN_C` can use compiled code.  Other drivers read the state of the Python
+        controller.
         """
         always, controller = self.compile == "always", driver.controller
         if not always and (self.compile == "never" or self._fault or find_compiler() is None):
@@ -250,17 +248,13 @@ class ControllerFactory:
         except InputError as error:
             if always:
                 raise
-            # Remember the failure of a build or download, so that the next runs do not try again.
+            # Remember that the build or the download failed, so that the next runs do not try again.
             self._fault = f"the controller runs in Python, not in C, which is slower: {error.line}"
             self.warnings.append(self._fault)
             return None
 
     def _stiffened(self, name: str, at: str, gain: float | None) -> Driver:
-        """Build controller ``name`` with additional stiffness.
-
-        The additional stiffness is equal to the stiffness of the impact-robust term at the resting posture of
-        controller ``at``.
-        """
+        """Build controller ``name`` with the stiffness of the impact-robust term where controller ``at`` rests."""
         robust = self.driver("robust", gain=gain)
         assert isinstance(robust, RobustDriver)  # noqa: S101 (the name says it)
         seconds = self.setup.scenario.task.settle

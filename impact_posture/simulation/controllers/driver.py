@@ -81,7 +81,7 @@ class Driver:
 
     @property
     def level(self) -> float:
-        """Level of the term that prepares for the impact, 0 to 1."""
+        """Activation level of the preparation for an impact, 0 to 1."""
         return self.posture.level if self.compiled is None else self.compiled.library.level
 
     def _call_posture(self, method: str, *arguments: Any, **named: Any) -> None:
@@ -145,7 +145,7 @@ class PostureDriver(Driver):
         super().__init__(setup, posture)
         self._goal = target
         self._since: float | None = None
-        # Tuples (body task, target at the start of the motion, target at its end).
+        # Tuples (task, target at the start of the motion, target at the end of the motion).
         self._moves: list[tuple[CenterOfMass | BaseOrientation, Any, Any]] = []
 
     def reset(self, q: Array) -> Command:
@@ -153,11 +153,11 @@ class PostureDriver(Driver):
         return super().reset(q)
 
     def brace(self) -> None:
-        """Move posture, center of mass and base orientation to the goal within :data:`MOVE`."""
+        """Move posture, center of mass and base orientation to the offline posture within :data:`MOVE`."""
         self._call_posture("move_to", self._goal, MOVE)
         model = self.setup.robot.model
         for task in self._body_tasks:
-            # The feet have the same positions in the goal posture and now, so this motion does not move the feet.
+            # The offline posture has the same positions of the feet, so this motion does not move the feet.
             if isinstance(task, CenterOfMass):
                 end = np.array(pin.centerOfMass(model, model.createData(), self._goal))
             else:
@@ -177,18 +177,20 @@ class PostureDriver(Driver):
 
     @property
     def level(self) -> float:
-        """Progress of the motion to the goal, 0 to 1."""
+        """Progress of the motion to the offline posture, 0 to 1."""
         return 0.0 if self._since is None else smooth(self._since / MOVE)
 
 
 class PathDriver(Driver):
     """Nominal controller whose posture follows a timed path after :meth:`brace`.
 
-    Between two points of the path, the posture is interpolated on the manifold.  Velocity and acceleration are
-    interpolated linearly.  The targets of center of mass and base orientation are computed from the posture.
+    Between two points of the path, the posture is interpolated on the configuration manifold.  Velocity and
+    acceleration are interpolated linearly.  The targets of center of mass and base orientation follow from the
+    posture.
 
     Attributes:
-        path: Path from the start posture (or the nearest posture that satisfies the constraints) to the optimum.
+        path: Path to the offline optimum, from the start posture or the nearest posture that satisfies the
+            constraints.
     """
 
     def __init__(self, setup: Setup, posture: JointPosture, path: PosturePath) -> None:

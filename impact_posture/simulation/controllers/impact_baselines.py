@@ -27,7 +27,7 @@ class ImpactFeedbackDriver(Driver):
     """
 
     FELT = 5.0
-    # If a force acts earlier than this before the expected time, it belongs to the previous impact, s.
+    # A force that acts more than this time before the expected impact belongs to the previous impact, s.
     EARLY = 0.2
 
     def __init__(self, setup: Setup, posture: JointPosture) -> None:
@@ -46,7 +46,7 @@ class ImpactFeedbackDriver(Driver):
         self._at, self._felt = t, False
 
     def _feel(self, reading: Reading) -> bool:
-        """Set the time of an impact that the force sensor measures.  Return whether a contact force acts now."""
+        """Update the time of the impact from the force sensor.  Return whether a contact force acts now."""
         acts = reading.force is not None and float(np.linalg.norm(reading.force)) > self.FELT
         if acts and not self._felt and reading.t > self._at - self.EARLY:
             self._at, self._felt = reading.t, True
@@ -71,16 +71,18 @@ class InvariantDriver(ImpactFeedbackDriver):
     """Feedback on the impact-invariant subspace around an impact (Yang and Posa 2021).
 
     An impulse at the contact changes ν only in the range of ``M⁻¹Jᵀ``.  Around the impact, the velocity feedback of
-    every task uses ``ν + α M⁻¹Jᵀ λ*`` instead of ν.  So the feedback does not oppose a velocity that an impulse can
-    have caused.  ``λ*`` minimizes ``‖ẏ_des − J_y (ν + M⁻¹Jᵀ λ)‖``.  If the time ``t`` is within ``T`` = ``WINDOW``
-    (s) of the impact at ``t*``, then ``α = 1 − exp(−(T − |t − t*|)/τ)`` with ``τ`` = ``FADE`` (s); otherwise, α is 0.
+    every task uses ``ν + α M⁻¹Jᵀ λ*`` instead of ν, so that the feedback does not oppose velocities that an impulse
+    can cause.  ``λ*`` minimizes ``‖ẏ_des − J_y (ν + M⁻¹Jᵀ λ)‖``.  If the time ``t`` is within ``T`` = ``WINDOW`` (s)
+    of the impact at ``t*``, then ``α = 1 − exp(−(T − |t − t*|)/τ)`` with ``τ`` = ``FADE`` (s); otherwise, α is 0.
 
-    There are three differences from the paper.  First, ``t*`` does not follow a schedule, because a force sensor
-    corrects it.  Second, if there are other tasks, the posture task does not affect ``λ*``, because its target is at
-    rest while the other tasks move.  In the paper, there is no redundant posture.  Third, the impulses at standing
-    feet follow from the impulse at the contact (``M⁻¹`` is contact-consistent).  In the paper, the impulses at the
-    feet are free variables.  Here, free impulses could explain every velocity of center of mass and base, so no
-    feedback would remain.
+    There are three differences from the paper:
+
+    1. A force sensor corrects the scheduled time ``t*`` of the impact.
+    2. If there are other tasks, the posture task does not affect ``λ*``, because the posture target is at rest while
+       the other tasks move.  The paper has no redundant posture.
+    3. The impulses at standing feet follow from the impulse at the contact (``M⁻¹`` contains the constraints of the
+       feet).  In the paper, the impulses at the feet are free variables.  Here, free impulses could explain every
+       velocity of center of mass and base, so no feedback would remain.
     """
 
     WINDOW, FADE = 0.05, 0.0025
@@ -113,8 +115,8 @@ class ReferenceSpreadingDriver(ImpactFeedbackDriver):
     The end effector has three references for its distance ``s`` along the approach:
 
     - Before the impact, the target speed is a function of the position: ``√(2 a s)``, at most the speed of the
-      scenario.  This reference continues behind the surface, so it is also valid if the impact is late.  The position
-      feedback along the approach is zero.
+      scenario.  The reference continues behind the surface, in case the impact is late.  There is no position
+      feedback along the approach.
     - The interim mode starts at the first touch.  It ends when the contact has lasted for ``SUSTAINED`` (s), or after
       ``INTERIM`` (s).  In this mode, no task has velocity feedback.  The position target continues with the speed
       before the impact, which establishes the contact.
@@ -123,19 +125,20 @@ class ReferenceSpreadingDriver(ImpactFeedbackDriver):
       constant.  ``ν⁺ = ν⁻ + Δν`` is the velocity after a rigid, inelastic impact at the velocity ``ν⁻`` before the
       touch.
 
-    There are four differences from the paper.  First, there is one contact instead of several simultaneous contacts,
-    and a rebound is treated as a partial contact.  Second, ``ν⁻`` is measured, because the tasks leave redundant
-    motions without a reference.  Third, the return follows the scenario in time.  Fourth, in a scenario without
-    contacts, this controller is the nominal controller.  With longer modes, the robot moves more, because this
-    controller reduces feedback and not motion.
+    There are four differences from the paper:
+
+    1. There is one contact instead of several simultaneous contacts, and a rebound is treated as a partial contact.
+    2. ``ν⁻`` is measured, because the tasks leave redundant motions without a reference.
+    3. The return motion is a function of time, as in the scenario.
+    4. In a scenario without contacts, this controller is the nominal controller.
     """
 
     SUSTAINED, INTERIM, SETTLE = 0.005, 0.05, 0.03
     # The target speed before the impact is computed with at least this distance, m.  With zero, the robot would never
     # start.
     BEGIN = 2e-3
-    # Distance at the touch, which increases in the interim mode (m); duration of the contact (s); time at which the
-    # interim mode ended (s), ``None`` before.
+    # Distance of the target along the approach at the touch, which increases in the interim mode, m; duration of the
+    # contact, s; time at which the interim mode ended, s, or ``None``.
     _touch: float
     _lasted: float
     _done: float | None
@@ -195,14 +198,14 @@ class ReferenceSpreadingDriver(ImpactFeedbackDriver):
 class ImpactAwareDriver(Driver):
     """Nominal controller with limits on joint velocities and impulsive torques after an impact (Wang et al. 2020).
 
-    From the begin of an approach until the return, each tick satisfies
-    :class:`~impact_posture.tsid.limits.impact_limits.ImpactLimits`, as if the impact happened in the next tick.  So
-    the approach is at most as fast as the limits of the robot allow.  If the limits allow the speed of the scenario,
-    the commands are the same as from the nominal controller.
+    From the start of an approach until the return, each tick satisfies
+    :class:`~impact_posture.tsid.limits.impact_limits.ImpactLimits`, as if the impact happened in the next tick.  The
+    approach is therefore at most as fast as the limits of the robot allow.  If the limits allow the speed of the
+    scenario, the commands are the same as from the nominal controller.
 
-    There are two differences from the paper.  First, if the present state violates limits, these limits are relaxed,
-    like joint limits.  The paper does not treat this case.  Second, the forces at the feet during the impact are not
-    limited.  In the paper, standing feet also satisfy zero-moment point and friction constraints during the impact.
+    There are two differences from the paper.  First, limits that the present state violates are relaxed, like joint
+    limits; the paper does not treat this case.  Second, the forces at the feet during the impact are not limited; in
+    the paper, standing feet also satisfy zero-moment point and friction constraints during the impact.
     """
 
     def __init__(self, setup: Setup, posture: JointPosture) -> None:

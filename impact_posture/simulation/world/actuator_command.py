@@ -88,7 +88,8 @@ class Push:
 class ActivePushes:
     """Pushes that act on a world.
 
-    ``active`` lists body, point in the coordinates of the body, force, and end of each push as a number of steps.
+    ``active`` lists, for each push, the body, the point in its coordinates, the force, and the step after the last
+    one.
     """
 
     def __init__(self, model: Any) -> None:
@@ -102,7 +103,7 @@ class ActivePushes:
                 "push": [[*point, *force] for point, force in zip(points, forces, strict=True)]}  # fmt: skip
 
     def begin(self, push: Push, body: int, point: Array, step: int) -> None:
-        """Begin a push at ``point`` in the coordinates of ``body``; errors as in :meth:`World.push`."""
+        """Begin a push at ``point`` in the coordinates of ``body``; raise the errors of :meth:`World.push`."""
         count = round(push.duration / self._model.opt.timestep) if np.isfinite(push.duration) else 0
         if count < 1 or not np.isfinite(push.force).all():
             raise InputError("the force or the duration is invalid", where=f"push at '{push.frame}'",
@@ -119,7 +120,7 @@ class ActivePushes:
 
 
 class JointStops:
-    """Position limits of the joints ``names``, which have the same order as the columns of ``Trace.stopped``."""
+    """Position limits of joints.  ``names`` has the order of the columns of ``Trace.stopped``."""
 
     def __init__(self, model: Any) -> None:
         limited = np.array(model.jnt_limited, dtype=bool)
@@ -161,10 +162,10 @@ class Truth(NamedTuple):
 
 
 class Trace(NamedTuple):
-    """True states of a world at n marks, with the quantities of :class:`Truth` and :class:`ShapeTruth`.
+    """True states at n calls of :meth:`World.mark`, with the quantities of :class:`Truth` and :class:`ShapeTruth`.
 
-    The first axis of each array has one entry per mark.  The second axis of ``stopped`` has one entry per joint with
-    limits.  The second axis of the arrays after ``stopped`` has one entry per shape.
+    The first axis of each array has n entries.  The second axis of ``stopped`` has one entry per joint with limits.
+    The second axis of the arrays after ``stopped`` has one entry per shape.
     """
 
     t: Array

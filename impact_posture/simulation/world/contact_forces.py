@@ -8,11 +8,11 @@ import numpy as np
 
 from impact_posture.system.arrays import Array
 
-# Constraint rows of a contact with friction.  A contact without friction has only the first row.
+# A contact with friction has three constraint rows.  A contact without friction has only the first row.
 _ROWS, _FIRST = np.arange(3), np.arange(3) == 0
 # Indices with which a cross product is computed: (a × b)ᵢ = a[_NEXT[i]] b[_LAST[i]] − a[_LAST[i]] b[_NEXT[i]].
 _NEXT, _LAST = [1, 2, 0], [2, 0, 1]
-# As soon as this number of steps is recorded, the steps are evaluated even without :meth:`ContactLog.look`.
+# After this number of steps, recorded contacts are evaluated even without a call of :meth:`ContactLog.look`.
 _MOST = 4096
 
 
@@ -95,7 +95,7 @@ class ContactLog:
         self._steps.append(_Step(number, data.time, *(part.copy() for part in parts)))
 
     def fold(self, number: int) -> None:
-        """Evaluate the recorded steps early if there are :data:`_MOST` or more and no mark is set."""
+        """Evaluate the recorded steps if there are at least :data:`_MOST` steps and no mark."""
         if len(self._steps) >= _MOST and not self._marks:
             self._marks.append((number, None))
             *_, peak, began, _ = self.look()
@@ -111,7 +111,7 @@ class ContactLog:
 
     def force(self, shape: int) -> list[float]:
         """Return the force on a shape in the last step with contact, world, N, shape (3,)."""
-        # For a single step, this loop is faster than the vectorized evaluation.
+        # For a single step, this loop is faster than :meth:`_evaluated`.
         step, force = self._steps[-1], np.zeros(3)
         contacts = zip(step.rows, step.sizes, self._shape_of[step.geoms], step.frames, strict=True)
         for row, size, pair, frame in contacts:
@@ -123,15 +123,15 @@ class ContactLog:
     def look(self) -> tuple[Array, ...]:
         """Return the quantities of :class:`ShapeTruth` except ``frame`` at all n marks, and clear the marks.
 
-        The first axis has one entry per mark, the second one per shape.  ``began`` is NaN if no surface touched the
-        shape since the previous mark.
+        The first axis has one entry per mark, and the second axis has one entry per shape.  ``began`` is NaN if no
+        surface touched the shape since the previous mark.
         """
         ends, count = np.array([number for number, _ in self._marks]), self._count
         numbers, n = np.array([step.number for step in self._steps]), ends.size
         # If a run ends within a tick, some steps come after the last mark.  These steps stay recorded.
         looked = int(np.searchsorted(numbers, ends[-1], side="right"))
         steps, numbers, self._steps = self._steps[:looked], numbers[:looked], self._steps[looked:]
-        # If no step was taken since the last evaluation, the contacts are unchanged.
+        # Marks without a step since the last evaluation have the contacts of this evaluation.
         unmoved = ends == self._number
         force, normal = self._force * unmoved[:, None, None], self._normal * unmoved[:, None]
         impulse, peak, began = np.zeros((n, count, 3)), np.zeros((n, count)), np.full((n, count), np.inf)

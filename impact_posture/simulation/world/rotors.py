@@ -20,7 +20,7 @@ class Rotors:
     Each speed follows its command ω*, clipped to ``[speed_min, speed_max]``, with ``ω̇ = (ω* − ω)/τ``.  τ is
     ``time_constant_up`` if ω* > ω and ``time_constant_down`` otherwise.  Each step uses the exact solution.  The
     thrust is ``c_f ω²`` along the direction of the rotor, and the drag moment is ``κ`` times the thrust, against the
-    spin.  Gyroscopic moments are not simulated, because the robot model contains no inertia of the propellers.
+    spin.  Gyroscopic moments are not simulated, because the robot model has no inertias of propellers.
 
     Raises:
         SpecError: ``speed_min`` is not below ``speed_max``.
@@ -32,7 +32,7 @@ class Rotors:
         self._up, self._down = -timestep / propulsion.time_constant_up, -timestep / propulsion.time_constant_down
         self._coefficient = propulsion.thrust_coefficient
         self.speeds: Array = np.full(len(propulsion.rotors), self._lowest)
-        # Number of steps n → ``exp(−k Δt/τ) − 1`` for k = 1 … n, with τ up and with τ down, both of shape (n, 1).
+        # n → ``exp(−k Δt/τ) − 1`` for the steps k = 1 … n, with τ up and with τ down, each of shape (n, 1).
         self._changes: dict[int, tuple[Array, Array]] = {}
 
     def reset(self, speeds: ArrayLike) -> None:

@@ -50,8 +50,8 @@ class Shape(StrictTable):
         size: Radius of a sphere, or three half extents of a box, m.
         kind: ``sphere``, or ``box`` with its edges along the axes of the frame.
         offset: Contact point in the coordinates of the frame, m.
-        center: Center of the shape in the coordinates of the frame, m.  By default, ``offset`` determines the center:
-            In the start posture, ``offset`` is the point of the sphere that is nearest to the first surface, or the
+        center: Center of the shape in the coordinates of the frame, m.  By default, the center is placed so that, in
+            the start posture, ``offset`` is the point of the sphere that is nearest to the first surface, or the
             middle of the nearest face of the box.
     """
 
@@ -87,7 +87,7 @@ class Physics(StrictTable):
     stop_solimp: FiniteVector = (0.95, 0.99, 0.001)
 
     def __post_init__(self) -> None:
-        """Check that MuJoCo would not silently change the contact law of the stops."""
+        """Check that MuJoCo would use the contact law of the stops without a change."""
         ContactLaw(solref=self.stop_solref, solimp=self.stop_solimp)
 
 
@@ -147,7 +147,7 @@ class Scene(StrictTable):
         return (("stops", self.physics.stop_solref), *((s.name, s.solref) for s in self.surfaces))
 
     def __post_init__(self) -> None:
-        """Check unique names, contact laws that suit the time step, and the shape of the force sensor."""
+        """Check that names are unique, contact laws suit the time step, and the force sensor has a shape."""
         for words, names in (
             ("surfaces are called", [s.name for s in self.surfaces]),
             ("shapes are at", [s.frame for s in self.shapes]),

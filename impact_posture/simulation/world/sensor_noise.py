@@ -98,7 +98,7 @@ class SensorNoise:
         self.reset(np.random.default_rng(0))
 
     def reset(self, generator: np.random.Generator) -> None:
-        """Use ``generator`` for all noise from now on.  Nothing else may draw from it."""
+        """Use ``generator`` for all noise from now on.  No other code may draw from ``generator``."""
         self._generator, self._drawn = generator, iter(np.zeros((0, 0)))
 
     def draw(self, n: int) -> Array:

@@ -120,7 +120,7 @@ class Ball:
         self._reach = (throw.radius + float(model.geom_size[self._target, 0]) + FLIGHT * throw.speed) * direction
 
     def throw(self, data: Any, sign: int) -> None:
-        """Place the ball and set its velocity, so that it touches a shape at rest after :data:`FLIGHT`."""
+        """Place the ball and set its velocity, so that the ball touches a shape at rest after :data:`FLIGHT`."""
         start = data.geom_xpos[self._target] - sign * self._reach
         data.qpos[self._position : self._position + 7] = [*start, 1.0, 0.0, 0.0, 0.0]
         data.qvel[self._velocity : self._velocity + 6] = [*(sign * self._velocity_0), 0.0, 0.0, 0.0]

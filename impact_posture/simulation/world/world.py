@@ -162,7 +162,7 @@ class World:
         with unwarned():
             self._advance(speed, count)
         state = self._data.qpos, self._data.qvel
-        # If the sum of squares is below the bound, every number is below it too.  Otherwise, check each number.
+        # If the sum of squares is below the bound, every number is below the bound.  Otherwise, check each number.
         usual = state[0].dot(state[0]) + state[1].dot(state[1]) < RUNAWAY**2
         if not usual and not all(np.abs(part).max() < RUNAWAY for part in state):
             raise SimulationDiverged(self.time, where=self.robot.name)
@@ -172,7 +172,7 @@ class World:
         model, data, first, second = self._model, self._data, self._mujoco.mj_step1, self._mujoco.mj_step2
         rotors, vibration, speeds, phases = self._rotors, self._vibration, np.zeros((count, 0)), np.zeros((count, 0))
         if rotors is not None:
-            # The speeds of the propellers do not depend on the robot, so all their steps are computed at once.
+            # The speeds of the propellers do not depend on the robot, so compute them for all steps at once.
             speeds = rotors.steps(command, count)
             thrusts = rotors.thrusts(speeds)
             phases = phases if vibration is None else vibration.steps(speeds, self.timestep)

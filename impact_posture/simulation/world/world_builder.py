@@ -58,8 +58,8 @@ def build_scene(robot: Robot, scene: Scene, q: Array, throw: Throw | None = None
     Raises:
         FrameNotFound: The frame of a shape does not exist.
         ContactError: The frame of a shape is welded to the world.
-        InputError: MuJoCo is not installed.  Or a shape has no center and the scene has no surface, or a surface has
-            no point and the scene has no shape.
+        InputError: MuJoCo is not installed, a shape without a center has no surface to determine the center, or a
+            surface without a point has no shape to determine the point.
         UnsupportedJoint: The robot has a joint that no MuJoCo motor can drive.
     """
     numeric = Numeric(robot.model).at(q)
@@ -137,7 +137,7 @@ def _placement(robot: Robot, numeric: Numeric, shape: Shape, normal: Array | Non
 
 
 def _point(surface: Surface, normal: Array, placed: list[tuple[Shape, pin.SE3]]) -> Array:
-    """Return the point of a surface.  By default, it is at the distance ``gap`` below the nearest shape."""
+    """Return a point of a surface.  By default, the surface is at the distance ``gap`` from the nearest shape."""
     if surface.point is not None:
         return np.array(surface.point, dtype=float)
     if not placed:
@@ -148,7 +148,7 @@ def _point(surface: Surface, normal: Array, placed: list[tuple[Shape, pin.SE3]])
 
 
 def _lowest(shape: Shape, placement: pin.SE3, normal: Array) -> Array:
-    """Return the point below the center of a shape (against the normal) at the height of its lowest point."""
+    """Return the point below the center of a shape (against the normal) at the height of the lowest point."""
     reach = shape.size[0]
     if shape.kind == "box":
         reach = float(np.abs(placement.rotation.T @ normal) @ np.array(shape.size))
