@@ -37,7 +37,7 @@ class Subgradients:
 
 
 class Minimized(Protocol):
-    """A function of the posture that can be minimized: numeric value, subgradients, and lifted form."""
+    """A function of the posture: numeric value, subgradients, and lifted form (:class:`Lifted`)."""
 
     @property
     def attempts(self) -> int:
@@ -78,7 +78,7 @@ class WorstCase(Minimized, Protocol):
         """Numeric impact quantities of the first contact for the nominal robot model."""
 
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
-        """Return the largest value and its tangent gradient, shape (nv,), in the symbols of the kernel ``k``."""
+        """Return the largest value and its tangent gradient, shape (nv,), as expressions of the symbols in ``k``."""
 
 
 class Objective(Minimized, Protocol):

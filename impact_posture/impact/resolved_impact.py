@@ -73,7 +73,7 @@ def _choose(settings: ImpactSettings, *, several: bool) -> tuple[ObjectiveKind, 
         return "impulse", "objective impulse: there is no approach speed"
     at = f"at {settings.speed:g} m/s with friction {settings.friction:g}"
     if settings.normal_cone:
-        what = f"objective sticking: {at}, the jump with friction has no worst case over a cone of normals"
+        what = f"objective sticking: {at}, the jump with friction has no exact worst case over a cone"
         return "sticking", what
     if settings.friction == 0:
         return "speed", f"objective speed: {at} the contact slips freely"

@@ -39,7 +39,7 @@ def check_compliance(robot: Robot, compliance: float) -> None:
     """Raise InputError for a support compliance ε, 1/kg, that is below :func:`least_compliance` or not finite."""
     least = least_compliance(robot)
     if not (np.isfinite(compliance) and compliance >= least):
-        hint = f"give at least {least:.3g}, which is 1e-6 over the mass; rounding errors hide stiffer feet"
+        hint = f"give at least {least:.3g}, which is 1e-6 divided by the mass; stiffer feet cause rounding errors"
         raise InputError(f"the compliance is {compliance:g} 1/kg", where="support_compliance", hint=hint)
 
 

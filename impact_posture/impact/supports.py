@@ -18,8 +18,8 @@ from impact_posture.robot.robot_spec import Support
 def resolve_supports(robot: Robot, texts: Sequence[str] | None) -> tuple[Support, ...]:
     """Turn texts ``FRAME[:point|surface]`` into supports; for ``None``, return the supports in ``robot.toml``.
 
-    If ``robot.toml`` lists the frame, the offset and size in ``robot.toml`` are used.  The kind in ``robot.toml`` is
-    used unless the text states a kind.
+    If ``robot.toml`` lists the frame, the offset and size in ``robot.toml`` are used.  The kind (point or
+    surface) in ``robot.toml`` is used unless the text states a kind.
 
     Raises:
         FrameNotFound: The robot has no such frame; the error lists the nearest names.

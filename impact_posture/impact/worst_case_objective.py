@@ -225,7 +225,7 @@ class WorstCaseObjective:
         return self.subgradients(q).first
 
     def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
-        """Return the gradients for all normals, impulses and models at most ``within`` below the maximum."""
+        """Return the gradients of all cases (normals, impulses, models) at most ``within`` below the maximum."""
         return self.worst_case.subgradients(q, within)
 
     def movable(self, q: Array) -> bool:
@@ -237,9 +237,9 @@ class WorstCaseObjective:
     def blind_motions(self) -> Array:
         """Return base twists that do not change the value, world axes, linear first, shape (k, 6).
 
-        The value depends on the pose of the base only through ``R_bᵀn``.  Therefore translations and the rotation
-        about the normal do not change it.  If the normal turns with the robot, no rotation changes the value.  If
-        contacts have different normals, every rotation may change it.
+        The value depends on the pose of the base only through the normal in base axes.  Therefore
+        translations and the rotation about the normal do not change it.  If the normal turns with the robot, no
+        rotation changes the value.  If contacts have different normals, every rotation may change the value.
         """
         n = np.array(self.contact.normal)
         turns = n[None, :]

@@ -60,7 +60,7 @@ class CoulombKind(ImpactKind):
         return Subgradients(np.array([coulomb_gradient(oracle, q, sides[k]) for k in near]), gaps[near])
 
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
-        """Return ``C`` and its tangent gradient, shape (nv,), in the symbols of a kernel.
+        """Return ``C`` and its tangent gradient, shape (nv,), as expressions of the symbols in ``k``.
 
         At the kink, the gradient of sticking is returned.
         """

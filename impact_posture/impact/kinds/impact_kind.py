@@ -82,7 +82,7 @@ class ImpactKind(ABC):
 
     @abstractmethod
     def unknowns(self, tree: Tree, n: ca.SX, label: str = "") -> UnknownJump:
-        """Return the velocity jump of an impact along ``n`` at ``tree.q``, as unknowns with equations."""
+        """Return the unknown velocity jump of an impact along ``n`` at ``tree.q``, with its equations."""
 
     @abstractmethod
     def jump(self, q: Array) -> tuple[Array, Array]:
@@ -134,7 +134,8 @@ class QuadraticKind(ImpactKind):
     def directions(self, mobility: Array, world: Array) -> Array:
         """Return three impulses as columns, shape (3, 3); :meth:`form` needs the velocity jumps that they cause.
 
-        Each impulse belongs to one column of ``world``, shape (3, 3).  ``mobility`` is ``JM⁻¹Jᵀ``, shape (3, 3).
+        Impulse k belongs to the world direction in column k of ``world``, shape (3, 3).  ``mobility`` is ``JM⁻¹Jᵀ``,
+        shape (3, 3).
 
         Raises:
             MetricError: The inverse of ``mobility`` is needed, but ``mobility`` is singular.

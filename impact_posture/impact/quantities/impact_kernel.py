@@ -31,7 +31,8 @@ class ImpactKernel:
     """Symbolic ``H, G, V, S, E, Λ_c`` and gradients of one impact.
 
     The symbol ``q`` has shape (nq, 1).  The symbol ``n``, shape (3, 1), is the normal in the axes ``normal_frame`` of
-    the contact.  With ``limbs``, the expressions of repeated limbs differ only in parameters.
+    the contact.  With ``limbs``, the expressions of repeated limbs (:class:`RepeatedLimbs`) differ only in
+    parameters.
     """
 
     def __init__(self, case: ImpactCase, q: ca.SX, n: ca.SX, limbs: RepeatedLimbs | None = None) -> None:

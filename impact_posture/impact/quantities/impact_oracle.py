@@ -142,7 +142,7 @@ class ImpactOracle:
     def gradient_H(self, q: Array, normal: Array | None = None) -> Array:
         """Return the tangent gradient of H, shape (nv,).
 
-        If given, ``normal``, shape (3,), replaces the normal of the contact; its axes are the same.
+        If given, ``normal``, shape (3,), replaces the normal of the contact, in the axes ``normal_frame``.
         """
         self.at(q)
         normal, n = self._normals(normal)
@@ -232,7 +232,11 @@ class ImpactOracle:
         return self.numeric.coupling_gradient(self.point, wrench, v, in_frame=in_frame)
 
     def inertial(self, left: ImpulseResponse, right: ImpulseResponse) -> Array:
-        """Return ``∂_q lᵀ(M + J_sᵀJ_s/ε)r = ∂_q [lᵀMr − f_lᵀJ_s r − f_rᵀJ_s l]`` for fixed l, r, f_l and f_r."""
+        """Return ``∂_q lᵀ(M + J_sᵀJ_s/ε)r = ∂_q [lᵀMr − f_lᵀJ_s r − f_rᵀJ_s l]``, shape (nv,).
+
+        ``l``, ``f_l`` and ``r``, ``f_r`` are the constant velocity jumps and support impulses of ``left`` and
+        ``right``.
+        """
         gradient = self.numeric.inertial_gradient(left.a, right.a)
         start = 0
         for foot in self.feet:

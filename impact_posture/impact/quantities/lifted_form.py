@@ -219,5 +219,5 @@ def worst_of(parts: Sequence[Lifted | UnknownJump], values: Sequence[ca.SX], sca
 
 
 def worst_of_guesses(parts: Sequence[Guess], largest: float, attempt: int) -> Guess:
-    """Return the guess for :func:`worst_of`; ``largest`` is the maximum in units of the scale."""
+    """Return initial values for :func:`worst_of`; ``largest`` is the maximum of ``values`` in units of the scale."""
     return Guess.joined([*parts, Guess.unbounded(np.array([largest + ABOVE[attempt]]))])

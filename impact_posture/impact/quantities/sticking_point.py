@@ -32,7 +32,7 @@ class StickingPoint:
     """A contact point whose velocity is prescribed in the directions in which it can move.
 
     The system ``M a − J_sᵀf − Jᵀs = τ, J_s a + εf = 0, J a = v`` is solved as a whole.  A solution with
-    ``(JM⁻¹Jᵀ)⁻¹`` would be less accurate, because its condition number would enter the gradient of S squared.
+    ``(JM⁻¹Jᵀ)⁻¹`` would be less accurate, because the condition number of ``JM⁻¹Jᵀ`` would enter squared.
     """
 
     system: Array

@@ -43,7 +43,7 @@ MOST_CONTACTS = 6
 
 @dataclass(frozen=True, eq=False)
 class WorstImpulses:
-    """The corner of the box of impulses with the largest jump.
+    """The corner of the box of impulses at which the velocity jump is largest.
 
     Attributes:
         value: Value of the objective: ``λᵀKλ`` at the corner.
@@ -68,7 +68,7 @@ class WorstImpulses:
 
 
 def check_contacts(contacts: Sequence[ImpactContact], kind: type[ImpactKind], *, bilateral: bool, cone: bool) -> None:
-    """Check that the worst case of the contacts over a box of impulses exists.
+    """Check that the worst case over a box of impulses is defined for the contacts.
 
     Raises:
         ContactError: There are too many contacts, two contacts have the same point and normal, or a single contact is
@@ -112,7 +112,7 @@ class ImpulseBox:
     """Worst case over the corners of the box ``0 ≤ λ_i ≤ λ̄_i``, or ``|λ_i| ≤ λ̄_i`` for bilateral contacts.
 
     Attributes:
-        oracles: Numeric impact quantities of each contact, the first contact first.
+        oracles: Numeric impact quantities, one object per contact.
         bilateral: Whether the contacts can pull as well as push.
         attempts: Number of different initial guesses that :meth:`guess` offers.
     """
@@ -152,7 +152,7 @@ class ImpulseBox:
         return jumps, np.asarray(np.einsum("ki,ij,kj->k", self.corners, K, self.corners))
 
     def _gradient(self, q: Array, impulses: Array) -> Array:
-        """Return ``∂_q‖Σ λ_i a_i‖²_W = 2 ∂_q[Σ λ_i n_iᵀJ_i b − bᵀMa]``, shape (nv,)."""
+        """Return ``∂_q‖a‖²_W = 2 ∂_q[Σ λ_i n_iᵀJ_i b − bᵀMa]`` for ``a = Σ λ_i a_i`` and ``Mb = Wa``, shape (nv,)."""
         oracles = [oracle.at(q) for oracle in self.oracles]
         first = oracles[0]
         forces = np.stack([oracle.J.T @ oracle.n for oracle in oracles], axis=1)

@@ -111,7 +111,7 @@ def worst_normal(A: Array, axis: Array, cone_deg: float) -> WorstNormal:
 def tied_normals(A: Array, axis: Array, cone_deg: float, worst: WorstNormal, tolerance: float) -> Array:
     """Return the normals whose value is at most ``tolerance · |A|`` below the largest value, shape (k, 3).
 
-    The worst normal is the first.  If these normals form an arc, a circle or a cap, enough samples are returned to
+    The worst normal comes first.  If these normals form an arc, a circle or a cap, enough samples are returned to
     represent the convex hull.
     """
     alpha = np.deg2rad(cone_deg)

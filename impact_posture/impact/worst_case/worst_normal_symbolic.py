@@ -1,8 +1,8 @@
 """The worst normal of a cone as a CasADi expression, which the C export evaluates.
 
-Choose the axes of the cone such that ``A = [a, bᵀ; b, diag(d₁, d₂)]`` with ``d₁ ≥ d₂``.  There are two cases.  In
-each case the normal follows from the root of a scalar function, to which Newton's method converges from the left
-without overshoot:
+Choose the axes of the cone such that ``A = [a, bᵀ; b, diag(d₁, d₂)]`` with ``gap = d₁ − d₂ ≥ 0``.  There are two
+cases.  In each case the normal follows from the root of a scalar function, to which Newton's method converges from
+the left without overshoot:
 
 - The normal is on the edge, ``n = (c, s w)``, ``|w| = 1``.  Then ``w_i = p_i/(ν − d_i)`` with ``p = b c/s``, and
   ``ν`` is the root of ``1/|w| = 1`` (a trust-region problem in the plane; Moré and Sorensen 1983).
@@ -49,7 +49,7 @@ def worst_normal_symbolic(A: ca.SX, axis: ca.SX, cone_deg: float) -> ca.SX:
     gap, above = 2 * radius, (P[1, 1] + P[2, 2]) / 2 + radius - P[0, 0]
     eta = _edge_root(b * (c / s), gap)
     w = _on_circle(b * (c / s), eta, gap)
-    # The eigenvector is inside the cone only if the secular function has its root above the root of the edge.
+    # The eigenvector is inside the cone only if the root of the secular function is above η, the root for the edge.
     is_edge = _secular(eta, above, b, gap)[0] >= 0
     xi = eta
     for _ in range(_INSIDE_STEPS):

@@ -160,7 +160,7 @@ class AttainableSpeed:
         return np.asarray(rows[:, self.free] * self.scale)
 
     def by_posture(self, model: Numeric, velocities: Array, weights: Array) -> Array:
-        """Return the tangent gradient, shape (nv,), of the sum of all rows with ``weights``, shape (m,)."""
+        """Return the tangent gradient, shape (nv,), of the weighted sum of all rows for constant velocities."""
         v = np.zeros(model.model.nv)
         v[self.free] = self.scale * velocities
         gradient = np.zeros(len(v))

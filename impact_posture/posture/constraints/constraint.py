@@ -154,7 +154,7 @@ class Constraint(ABC):
 
     @abstractmethod
     def lift(self, tree: Tree, parameters: ca.SX) -> LiftedRows:
-        """Return the rows for the nonlinear program; ``tree`` has the argument ``chart_x`` of :class:`Kinematics`."""
+        """Return the rows for the nonlinear program; ``tree`` is symbolic in chart coordinates."""
 
     @property
     def lifted_bounds(self) -> tuple[Array, Array]:
@@ -209,7 +209,7 @@ class Constraint(ABC):
         return self.name if self.rows == 1 else f"{self.name}[{row}]"
 
     def pose_error(self, value: Array) -> tuple[float, float]:
-        """Return the position (m) and orientation error (rad) of a held pose; ``value`` is ``c(q)``."""
+        """Return the position error (m) and orientation error (rad) of a held pose; ``value`` is ``c(q)``."""
         return 0.0, 0.0
 
 
@@ -218,7 +218,7 @@ class ExpressionConstraint(Constraint):
 
     @abstractmethod
     def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
-        """Return ``c(q)`` as an expression, shape (rows, 1), with ``tree`` as in :meth:`Constraint.lift`."""
+        """Return ``c(q)`` as an expression, shape (rows, 1), at ``tree.q``."""
 
     def lift(self, tree: Tree, parameters: ca.SX) -> LiftedRows:
         return LiftedRows(self.symbolic(tree, parameters))

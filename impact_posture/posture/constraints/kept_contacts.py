@@ -25,7 +25,7 @@ class KeptContacts(ExpressionConstraint):
     (:mod:`impact_posture.impact.friction.contact_stability`).  The impulses ``f`` of feet with compliance ε are one
     of the possible solutions.  The constraint is therefore sufficient for the feet to stay, but stricter than
     necessary if there are several solutions.  ``numeric`` is the model at the given posture.  This posture defines
-    the axes of the soles, which do not change, and the scale of ``A``: the largest impulse there is 1.
+    the axes of the soles, which do not change.  ``A`` is divided by the largest impulse at this posture.
     """
 
     def __init__(self, objective: WorstCaseObjective, numeric: Numeric, friction: float, variant: str = "") -> None:

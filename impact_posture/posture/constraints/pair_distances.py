@@ -17,8 +17,8 @@ class PairDistances:
 
     Three fast lower bounds show that most pairs are far apart.  The first bound is the distance between balls around
     the bodies.  The second is the last exact distance minus the motion of the bodies since then.  The third is the
-    larger gap between the hulls along two directions.  The values at the last posture are stored, because a search
-    evaluates a posture several times.
+    larger of the two gaps between the hulls along two directions.  The values at the last posture are stored, because
+    a search evaluates a posture several times.
     """
 
     def __init__(self, pairs: Sequence[SeparatingPlane]) -> None:

@@ -33,7 +33,7 @@ class HeldPosition(ExpressionConstraint):
         return np.asarray(model.placement(self.point).translation - self.parameters)
 
     def pose_error(self, value: Array) -> tuple[float, float]:
-        """Return the distance from the target or its box, m, and a zero orientation error."""
+        """Return the distance from the target or from the allowed box, m, and a zero orientation error."""
         return float(np.linalg.norm(self.excess(value))), 0.0
 
 
@@ -93,7 +93,7 @@ class HeldOrientation(ExpressionConstraint):
         """
         error = (self._left * pin.Quaternion(rotation) * self._right).coeffs()
         x, y, z, w = (error if error[3] >= 0 else -error).tolist()
-        # d(2 vec(Q)) = (w I + [v]×) ω with ω in rotated axes: the rotation of the frame times the matrix of `right`.
+        # d(2 vec(Q)) = (w I + [v]×) ω, with ω in the axes of the frame, turned by Q_right.
         turn = np.array([[w, -z, y], [z, w, -x], [-y, x, w]])[: self.rows] @ (rotation @ self._axes).T
         return 2 * np.array([x, y, z])[: self.rows], turn @ jacobian
 
@@ -160,7 +160,7 @@ class AxisInCone(ExpressionConstraint):
 
 
 class HeldTurn(ExpressionConstraint):
-    """The base does not turn about ``axis``, one of its own axes: ``2 axis·vec(Q*⁻¹ ⊗ Q(q)) = 0``.
+    """The base does not turn about ``axis``, which is fixed in the base: ``2 axis·vec(Q*⁻¹ ⊗ Q(q)) = 0``.
 
     ``point`` is the origin of the base, ``target`` the orientation ``Q*`` of the base before a turn, shape (3, 3),
     and ``axis`` a unit vector in base axes, shape (3,).

@@ -18,12 +18,12 @@ class Requirements:
     Attributes:
         contact_pose: What is constrained in the pose of the first contact frame; same values as the setting
             ``contact_pose``.
-        other_poses: The same for each further contact frame.
+        other_poses: As ``contact_pose``, for each further contact frame.
         target_position: Target position of the contact frame, world axes, m; ``None`` for its initial position.
         target_quaternion: Target orientation of the contact frame, x y z w; ``None`` for its initial orientation.
         box: Half extents of the box in which the contact frame must stay if ``contact_pose`` is ``box``, m.
-        base: How the floating base may move: ``free``, ``level`` (tilt zero, yaw free), ``level:DEG`` (tilt from its
-            default posture at most DEG degrees, yaw free), ``fixed`` or ``box``.
+        base: How the floating base may move: ``free``, ``level`` (tilt zero, yaw free), ``level:DEG`` (tilt from the
+            upright orientation at most DEG degrees, yaw free), ``fixed`` or ``box``.
         base_box: Half extents of the box in which the base must stay if ``base`` is ``box``, m.
         keep: Frames whose pose must not change.
         hold: Joints whose position must not change.

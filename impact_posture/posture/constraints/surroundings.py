@@ -152,7 +152,7 @@ class Surroundings:
 
     @cached_property
     def constraints(self) -> list[Clearance]:
-        """One constraint for the distances between links, and one for the distances of links from each wall."""
+        """One constraint for the distances between links, and one for each plane or body around the robot."""
         near = f"at least {1e3 * self._clearance:g} mm apart"
         pairs = [SeparatingPlane(self._bodies[i], self._bodies[j], self._clearance) for i, j in self.shapes.pairs]
         groups = [("self-collision", pairs, f"links {near} ({len(pairs)} pairs)")]

@@ -49,7 +49,7 @@ class Prepared:
 
 
 def read_settings(path: Path, over: dict[str, object] | None = None) -> ProblemSettings:
-    """Read a ``problem.toml`` with paths relative to its folder; options in ``over`` replace its keys."""
+    """Read a ``problem.toml`` with paths relative to its folder; options in ``over`` replace keys of the file."""
     data = from_folder(read_toml(path), path.resolve().parent, (*_FILES, "weights", "armature", "posture"))
     over = over or {}
     # An option also replaces keys that describe the same quantity in another form.
@@ -91,7 +91,7 @@ def _held_by_default(robot: Robot) -> tuple[str, ...]:
 
 
 def requirements(settings: ProblemSettings, objective: Objective) -> Requirements:
-    """Return the requirements of the settings; if a setting is ``None``, the value of the robot is used.
+    """Return the requirements of the settings; a setting ``None`` selects the value in the robot's data.
 
     Raise ``InputError`` if a setting concerns feet and there are no supports.
     """

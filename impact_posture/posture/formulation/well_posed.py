@@ -1,4 +1,4 @@
-"""Make a problem well-posed: fix undetermined motions, omit redundant equalities, block first-order turns."""
+"""Make a problem well-posed: fix free motions, omit redundant rows, block turns that exist only to first order."""
 
 from __future__ import annotations
 

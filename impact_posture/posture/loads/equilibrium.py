@@ -118,10 +118,10 @@ class Equilibrium:
         return A, b, np.vstack([torques, thrusts]), np.append(c, -middle / half)
 
     def spares(self, q: Array, room: float) -> bool:
-        """Return whether nearly even forces balance the base with all shares up to ``1 − room``.
+        """Return whether nearly even forces balance the base with no share above ``1 − room``.
 
-        If so, the posture can be held, and no linear program is needed.  If not, other forces may still hold the
-        posture.
+        Nearly even forces are thrusts in the middle of their ranges and equal foot forces, both corrected to balance
+        the base.  If they suffice, no linear program is needed.  If not, other forces may still hold the posture.
         """
         key = q.tobytes()
         if self._even is None or self._even[0] != key:

@@ -80,7 +80,7 @@ def load_cases(objective: Objective, q: Array, requirements: Requirements) -> Lo
     with this payload.
 
     Raises:
-        InputError: A force has to be held, but the data of the robot are not sufficient.
+        InputError: ``hold_force`` is set, but the data of the robot are not sufficient.
     """
     robot, force, share = objective.robot, requirements.hold_force, requirements.limit_share
     weight = robot.mass * float(np.linalg.norm(robot.model.gravity.linear))

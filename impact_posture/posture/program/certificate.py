@@ -98,7 +98,7 @@ def certify(
     auxiliaries: Array | None = None,
     numeric: Numeric | None = None,
 ) -> Certificate:
-    """Certify the posture ``q``.
+    """Compute the certificate of the posture ``q``.
 
     ``scale`` is the initial objective f₀.  ``auxiliaries`` are the values of the auxiliary unknowns of the
     constraints at ``q``, by default :meth:`ConstrainedProblem.guess`.  A model ``numeric`` that the caller passes is

@@ -7,8 +7,8 @@ In the lifted formulation, the linear equations of the impact are constraints of
                           c(q) within bounds,  |quaternions| = 1,  limits,
 
 In this formulation, every function is linear or quadratic in a, f and s, and the exact Hessian stays small
-(``docs/studies/formulations.py`` compares both forms).  A worst case adds unknowns and rows
-(:mod:`impact_posture.impact.worst_case.model_set`).
+(``docs/studies/formulations.py`` compares it with the form that eliminates a, f and s).  A worst case adds unknowns
+and rows (:mod:`impact_posture.impact.worst_case.model_set`).
 """
 
 from __future__ import annotations
