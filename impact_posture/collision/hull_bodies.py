@@ -60,7 +60,7 @@ def _fill(a: Body, b: Body) -> bool:
     points, part = np.vstack(parts), np.repeat(np.arange(len(parts)), [len(corners) for corners in parts])
     hull = SweptHull("", "", 0, points, 0.0)
     faces = hull.faces
-    # Check only large faces between different shapes.  Other faces lie in one shape, or near their corners.
+    # Check only large faces between different shapes.  Every other face lies in a shape, or is near its own corners.
     edges = np.linalg.norm(points[faces] - points[np.roll(faces, 1, axis=1)], axis=2).max(axis=1)
     open_faces = np.flatnonzero(np.any(part[faces] != part[faces[:, :1]], axis=1) & (edges > _FILL))
     solids = [SweptHull("", "", 0, _thinned(corners), 0.0) for corners in parts]

@@ -64,7 +64,7 @@ def nested_pairs(
     """Return the pairs of nested bodies, for example a shaft in a fork.
 
     Their hulls overlap at more than half of the postures where their shapes do not touch.  Keeping the hulls apart
-    would forbid most postures.  ``touch`` tells whether the shapes touch at the placements in the data.
+    would forbid most postures.  ``touch`` tells whether the shapes touch at given placements.
     """
     data = robot.model.createData()
     apart, forbidden = np.zeros((2, len(pairs)), dtype=int)
@@ -85,7 +85,7 @@ def nested_pairs(
 
 
 def touch_of(shapes: Sequence[pin.GeometryObject]) -> Callable[[Pair, pin.Data], bool]:
-    """Return a function that tells whether two shapes touch at the placements in the data."""
+    """Return a function that tells whether two shapes touch at the joint placements in a ``pin.Data``."""
 
     def touch(pair: Pair, data: pin.Data) -> bool:
         a, b = (shapes[k] for k in pair)

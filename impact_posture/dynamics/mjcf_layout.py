@@ -136,7 +136,7 @@ class MjcfLayout:
 
 
 def _turn(slot: MjcfSlot, piece: Array) -> Array:
-    """Return the rotation of linear velocities from Pinocchio to MuJoCo axes; ``piece`` is the part of ``q``."""
+    """Return the rotation of linear velocities from Pinocchio to MuJoCo axes; ``piece`` is the joint's ``q``."""
     if slot.joint.kind.family == "planar":
         return np.array([[piece[2], -piece[3]], [piece[3], piece[2]]])
     R = pin.Quaternion(np.array(piece[3:])).matrix()

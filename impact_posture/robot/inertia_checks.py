@@ -18,7 +18,8 @@ _TINY = 1e-10
 _LARGEST = 1e100
 # Relative violation of the triangle inequality that is treated as a rounding error.
 _TRIANGLE_SLACK = 1e-3
-# Ratio of extreme eigenvalues below which a mass matrix with unit diagonal is singular; known robots exceed 1e-3.
+# A mass matrix, scaled to unit diagonal, is singular if its smallest eigenvalue is below this times the largest.  The
+# smallest ratio of the known robots is above 1e-3.
 _SINGULAR = 1e-12
 
 
@@ -94,7 +95,7 @@ def check_mass_matrix(robot: Robot, where: str) -> None:
     M = (upper + np.triu(upper, 1).T)[np.ix_(moving, moving)]
     diagonal = np.diag(M)
     if not np.abs(M).max() <= _LARGEST:
-        fault = f"the mass matrix has entries beyond all numbers at posture '{robot.default_posture}'"
+        fault = f"the mass matrix has infinite or huge entries at posture '{robot.default_posture}'"
         hint = "correct the masses, inertias, lengths and `armature`; they are in kg, kg m² and m"
         raise InertiaError(fault, where=where, hint=hint)
     free = diagonal <= _TINY

@@ -8,7 +8,7 @@ import numpy as np
 
 from impact_posture.system.arrays import Array
 
-# Largest distance (m) of a point that lies on a line; number of decimals to which edges are rounded.
+# A point within this distance (m) of a line counts as on the line.  Edges are rounded to this number of decimals.
 _ROUNDING, _DIGITS = 1e-9, 12
 
 

@@ -36,7 +36,7 @@ def check_output(out: Path, *, force: bool, kind: Kind) -> None:
     """
     check_name(out)
     if out.is_symlink():
-        raise OutputError("is a symbolic link", where=str(out), hint="name the folder that it leads to, or another")
+        raise OutputError("is a symbolic link", where=str(out), hint="name the target of the link, or another folder")
     if os.path.lexists(out) and not out.is_dir():
         raise OutputError("exists and is not a folder", where=str(out), hint="choose another `out`")
     if Path(os.path.realpath(out)) in (Path.cwd(), *Path.cwd().parents):
@@ -230,7 +230,7 @@ def _replace(beside: Path, out: Path, force: bool, kind: Kind) -> None:
     old = out.with_name(f"{out.name}.old-{secrets.token_hex(4)}")
     os.rename(out, old)
     try:
-        # Check again, because from now on no other process writes there.
+        # Check again: since the rename, no other process writes into the old folder.
         if any(old.iterdir()):
             _check_ours(old, kind)
         os.rename(beside, out)
