@@ -3,19 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import cached_property
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
 
 from impact_posture.path.path_search import even
 from impact_posture.path.path_space import STEP, PathSpace
+from impact_posture.path.row_interpolation import Moment
+from impact_posture.posture.manifold.feasible_start import Projector
 from impact_posture.system.arrays import Array
+
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicSpline
 
 # Largest permitted distance of the curve from the constraints, measured in the tangent space.
 DEVIATION = 1e-5
 # How often the number of knots may double; at corners of a path along bodies, each time halves the deviation.
 _DOUBLINGS = 7
+# Knots of the projected spline for each knot of the spline.  They divide the distance from the constraints by 8⁴.
+_FINER = 8
 # Step of central differences along the curve, whose length is 1.
 _STEP = 1e-5
 # A knot is a corner if the curve bends this many times more there than at the median knot.
@@ -25,7 +35,10 @@ _AT_CORNERS, _BETWEEN = 8, 2
 
 
 class PathCurve:
-    """The cubic spline ``q(s) = q₀ ⊕ z(s)``, ``0 ≤ s ≤ 1``, through two or more postures.
+    """The cubic spline ``q₀ ⊕ z(s)``, ``0 ≤ s ≤ 1``, through two or more postures, projected onto the equalities.
+
+    The projection is as smooth as the spline.  Inequalities and joint limits are not part of it, because the velocity
+    of a motion that follows them exactly jumps where it meets them.
 
     ``s`` has the values at the postures, evenly by path length, and ``z`` their tangent coordinates at the first
     posture, shape (n, nv).
@@ -63,19 +76,28 @@ class PathCurve:
         """Return the posture of tangent coordinates, ``q₀ ⊕ z``, shape (nq,)."""
         return np.asarray(pin.integrate(self._space.model, self._start, z))
 
-    def posture(self, s: float) -> Array:
-        """Return ``q(s)``, shape (nq,)."""
-        return self.at(self.spline(s))
+    def moment(self, s: float) -> Moment:
+        """Return ``q(s)``, ``ν = dq/ds`` in the tangent space there, and ``dν/ds``."""
+        model, (z, dz, ddz) = self._space.model, (self._projected(s, order) for order in range(3))
+        ahead, turn, behind = (pin.dIntegrate(model, self._start, z + x * dz, pin.ARG1) for x in (_STEP, 0.0, -_STEP))
+        return self.at(z), turn @ dz, turn @ ddz + (ahead - behind) @ dz / (2 * _STEP)
 
-    def velocity(self, s: float) -> Array:
-        """Return ``ν = dq/ds`` in the tangent space at ``q(s)``, shape (nv,)."""
-        turn = pin.dIntegrate(self._space.model, self._start, self.spline(s), pin.ARG1)
-        return np.asarray(turn @ self.spline(s, 1))
+    @cached_property
+    def _projected(self) -> CubicSpline:
+        """The spline through postures of the first spline that are projected onto the equalities."""
+        from scipy.interpolate import CubicSpline
 
-    def acceleration(self, s: float) -> Array:
-        """Return ``dν/ds``, shape (nv,)."""
-        low, high = max(s - _STEP, 0.0), min(s + _STEP, 1.0)
-        return (self.velocity(high) - self.velocity(low)) / (high - low)
+        problem, s = self._space.problem, np.linspace(0.0, 1.0, _FINER * (len(self.s) - 1) + 1)
+        free = np.full(len(problem.lower), np.inf)
+        equalities = tuple(c for c in problem.constraints if c.equality)
+        projector = Projector(replace(problem, constraints=equalities, lower=-free, upper=free))
+        z = self.spline(s)
+        for row in z:
+            q = self.at(row)
+            row += self._space.difference(self._start, projector.project(q).q) - self._space.difference(
+                self._start, q
+            )
+        return CubicSpline(s, z)
 
     def deviation(self) -> float:
         """Return the largest tangent distance of the curve from the constraints; infinite if a posture is not valid.
@@ -87,7 +109,7 @@ class PathCurve:
         # The knots themselves are on the constraints.
         parts = max(2, self._space.checks(np.abs(np.diff(self.z, axis=0)).max(axis=0)))
         for s in np.linspace(0.0, 1.0, parts * (len(self.s) - 1) + 1):
-            off = self.posture(float(s))
+            off = self.at(self.spline(float(s)))
             q = self._space.pulled(off)
             if q is None or self._space.size(self._space.difference(before, q)) > 1:
                 return float("inf")

@@ -14,6 +14,7 @@ from impact_posture.dynamics.chart import Chart
 from impact_posture.errors import printable
 from impact_posture.path.path_timing import LimitUse
 from impact_posture.path.posture_path import PosturePath
+from impact_posture.path.row_interpolation import INTERPOLATION
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 from impact_posture.system.npz_files import read_arrays
@@ -30,7 +31,8 @@ def write_path(folder: Path, robot: Robot, path: PosturePath) -> None:
     """Write ``path.csv``, ``path.npz`` and ``path.yaml`` into a folder.
 
     The rows of the CSV have the time ``t`` (s), positions ``q:…``, velocities ``v:…`` and accelerations ``a:…`` by
-    name.  A continuous joint is an angle without jumps.  The YAML is a ``trajectory_msgs/JointTrajectory``.
+    name.  A continuous joint is an angle without jumps.  The YAML is a ``trajectory_msgs/JointTrajectory``.  Between
+    two rows, the limits hold for the quintic polynomial that has the values of both rows.
     """
     names, angles = positions(robot, path.q)
     columns = [printable(name) for name in robot.tangent_names]
@@ -103,7 +105,10 @@ def _trajectory(robot: Robot, path: PosturePath, angles: Array) -> str:
             "time_from_start": {"sec": whole, "nanosec": part},
         })  # fmt: skip
     message = {"header": {"frame_id": ""}, "joint_names": [s.name for s in slots], "points": points}
-    lines = ["# trajectory_msgs/JointTrajectory"]
+    lines = [
+        "# trajectory_msgs/JointTrajectory",
+        f"# Interpolation: {INTERPOLATION} between points, as in joint_trajectory_controller",
+    ]
     if robot.floating:
         lines.append("# The base floats: its pose over time is in path.csv (q:base ...).")
     lines.append(yaml.safe_dump(message, sort_keys=False, default_flow_style=None, width=10**6))

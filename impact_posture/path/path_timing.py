@@ -11,7 +11,8 @@ from impact_posture.path.actuator_limits import ActuatorLimits
 from impact_posture.path.path_curve import PathCurve
 from impact_posture.path.path_space import PathSpace
 from impact_posture.path.speed_profile import slowed
-from impact_posture.path.timed_curve import SAMPLE_TIME, TimedCurve, times
+from impact_posture.path.time_law import polynomial, stepped
+from impact_posture.path.timed_curve import SAMPLE_TIME, TimedCurve, moment, sampled
 from impact_posture.system.arrays import Array
 
 # Intervals of the time-optimal parametrization; within an interval, a limit may be exceeded by less than 1 %.
@@ -25,6 +26,8 @@ _ACTIVE = 0.98
 _ONE_AXIS = ("revolute", "continuous", "prismatic")
 # A time-optimal motion with a larger share of a limit at one of its points is not used.
 _EXCEEDED = 1.01
+# The smooth law 6 τ⁵ − 15 τ⁴ + 10 τ³, highest power first.
+_SMOOTH = np.array([6.0, -15.0, 10.0, 0.0, 0.0, 0.0])
 
 
 def time_optimal(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedCurve | None:
@@ -58,17 +61,12 @@ def time_optimal(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> 
     ]  # fmt: skip
     # The parameter is the path length, because TOPP-RA loses digits where the speed along the path is far from 1.
     size = space.length([curve.at(z) for z in curve.z])
-    planner = TOPPRA(
-        constraints, SplineInterpolator(size * curve.s, curve.z), gridpoints=np.linspace(0.0, size, _GRID + 1),
-        # The default, a spline over time, exceeds the torque limits by a quarter where the torques switch.
-        parametrizer="ParametrizeConstAccel",
-    )  # fmt: skip
-    trajectory = planner.compute_trajectory()
-    if trajectory is None:
+    places = np.linspace(0.0, 1.0, _GRID + 1)
+    planner = TOPPRA(constraints, SplineInterpolator(size * curve.s, curve.z), gridpoints=size * places)
+    rates = planner.compute_parameterization(0.0, 0.0)[1]
+    if rates is None or not np.isfinite(rates).all():
         return None
-    t = times(float(trajectory.duration))
-    z, v, a = (np.asarray(trajectory(t, order)) for order in range(3))
-    return TimedCurve(t, z, v, a, "time-optimal")
+    return sampled(space, curve, limits, stepped(places, rates / size), "time-optimal")
 
 
 def scaled(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedCurve:
@@ -79,9 +77,9 @@ def scaled(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedC
     spread evenly, plus those at the places of the curve, most of which are at corners.  If a curve has corners and
     :func:`slowed` takes less time, the result is the slowed motion.
     """
-    fine = np.linspace(0.0, 1.0, _INVERSE)
-    notes, tau = [], np.concatenate([np.linspace(0.0, 1.0, INSTANTS), np.interp(curve.places, _law(fine)[0], fine)])
-    rates = [_rates(curve, float(x)) for x in tau]
+    fine, law = np.linspace(0.0, 1.0, _INVERSE), polynomial(_SMOOTH, 1.0)
+    notes, tau = [], np.concatenate([np.linspace(0.0, 1.0, INSTANTS), np.interp(curve.places, law.at(fine)[0], fine)])
+    rates = [moment(curve, law, x) for x in tau.tolist()]
     speed, known = space.problem.robot.velocity_limits, not limits.missing
     least = np.zeros(len(tau))
     if known:
@@ -104,18 +102,9 @@ def scaled(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedC
     duration = max(float(least.max()), SAMPLE_TIME)
     if known and curve.corners.any():
         slower = slowed(space, curve, limits)
-        if slower is not None and slower.t[-1] < duration:
+        if slower is not None and slower.rows.t[-1] < duration:
             return slower
-    t = times(duration)
-    motion = [_rates(curve, float(x)) for x in t / duration]
-    return TimedCurve(
-        t,
-        curve.spline(_law(t / duration)[0]),
-        np.array([v for _, v, _ in motion]) / duration,
-        np.array([a for _, _, a in motion]) / duration**2,
-        "scaled",
-        tuple(notes),
-    )
+    return sampled(space, curve, limits, polynomial(_SMOOTH, duration), "scaled", tuple(notes))
 
 
 def _cannot_move(space: PathSpace, limits: ActuatorLimits, loads: Sequence[tuple[Array, Array]]) -> str:
@@ -138,7 +127,7 @@ def timed(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedCu
     axes = all(slot.kind.family in _ONE_AXIS for slot in space.projector.chart.slots)
     if not limits.missing and axes and not space.problem.robot.floating:
         fastest = time_optimal(space, curve, limits)
-        if fastest is not None and _exceeded(space, curve, fastest, limits) <= _EXCEEDED:
+        if fastest is not None and _exceeded(space, fastest, limits) <= _EXCEEDED:
             return fastest
         slower = slowed(space, curve, limits)
         if slower is not None:
@@ -146,13 +135,13 @@ def timed(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedCu
     return scaled(space, curve, limits)
 
 
-def _exceeded(space: PathSpace, curve: PathCurve, motion: TimedCurve, limits: ActuatorLimits) -> float:
-    """Return the largest share of a limit that a motion of a fixed base needs."""
-    largest = float((np.abs(motion.v) / space.problem.robot.velocity_limits).max())
-    for z, v, a in zip(motion.z, motion.v, motion.a, strict=True):
-        q = curve.at(z)
+def _exceeded(space: PathSpace, motion: TimedCurve, limits: ActuatorLimits) -> float:
+    """Return the largest share of a limit that a motion of a fixed base needs, at its rows and between them."""
+    largest = 0.0
+    for q, v, a in map(motion.rows.at, motion.instants):
         used = limits.shares(q, limits.load(q, v, a))
-        largest = max(largest, float(np.abs(used).max(initial=0.0)) if used is not None else np.inf)
+        speed = float((np.abs(v) / space.problem.robot.velocity_limits).max())
+        largest = max(largest, speed, float(np.abs(used).max(initial=0.0)) if used is not None else np.inf)
     return largest
 
 
@@ -172,23 +161,26 @@ class LimitUse:
     largest: dict[str, object]
 
 
-def limit_use(space: PathSpace, motion: TimedCurve, postures: Array, limits: ActuatorLimits) -> LimitUse:
-    """Return the shares of the limits along a motion with its postures on the constraints, shape (n, nq).
+def limit_use(space: PathSpace, motion: TimedCurve, limits: ActuatorLimits) -> LimitUse:
+    """Return the shares of the limits along a motion, at its rows and between them.
 
     Forces of feet and of more than six rotors are not unique.  The result uses the forces whose largest share of a
     limit is smallest.
     """
-    robot, count = space.problem.robot, len(motion.t)
-    # For a floating robot, each instant needs a linear program. Only some instants are checked: evenly spread ones,
-    # and those with large accelerations.
-    even = [round(k) for k in np.linspace(0, count - 1, INSTANTS)]
-    bent = np.argsort(-np.abs(motion.a).max(axis=1), kind="stable")[:INSTANTS].tolist()
-    every = sorted({*even, *bent}) if robot.floating else list(range(count))
-    shares = np.full((len(every), len(limits.names)), np.nan)
-    for row, k in enumerate([] if limits.missing else every):
-        needed = limits.shares(postures[k], limits.load(postures[k], motion.v[k], motion.a[k]))
+    robot, t = space.problem.robot, motion.instants
+    moments = [motion.rows.at(time) for time in t]
+    if robot.floating:
+        # Each instant needs a linear program. Only some are checked: evenly spread ones, and those with large
+        # accelerations.
+        even = [round(k) for k in np.linspace(0, len(t) - 1, INSTANTS)]
+        bent = np.argsort([-np.abs(a).max() for _, _, a in moments], kind="stable")[:INSTANTS].tolist()
+        every = sorted({*even, *bent})
+        t, moments = t[every], [moments[k] for k in every]
+    shares = np.full((len(t), len(limits.names)), np.nan)
+    for row, moment_ in enumerate([] if limits.missing else moments):
+        needed = limits.shares(moment_[0], limits.load(*moment_))
         shares[row] = np.nan if needed is None else needed
-    groups = {"velocity": (np.abs(motion.v[every]) / robot.velocity_limits, robot.tangent_names)}
+    groups = {"velocity": (np.abs([v for _, v, _ in moments]) / robot.velocity_limits, robot.tangent_names)}
     for kind in ("torque", "thrust"):
         columns = [k for k, other in enumerate(limits.kinds) if other == kind]
         groups[kind] = np.abs(shares[:, columns]), tuple(limits.names[k] for k in columns)
@@ -203,19 +195,6 @@ def limit_use(space: PathSpace, motion: TimedCurve, postures: Array, limits: Act
     standing = bool(space.problem.objective.supports) and not motion.notes
     largest["active"] = most if sizes[most] > _ACTIVE else "friction" if standing else None
     velocity, torque, thrust = (
-        used.max(axis=1) if used.shape[1] else np.full(len(every), np.nan) for used, _ in groups.values()
+        used.max(axis=1) if used.shape[1] else np.full(len(t), np.nan) for used, _ in groups.values()
     )
-    return LimitUse(motion.t[every], velocity, torque, thrust, largest)
-
-
-def _law(tau: Array) -> tuple[Array, Array, Array]:
-    """Return ``s(τ)`` and its first two derivatives, which are zero at both ends."""
-    first, second = 30 * tau**2 * (1 - tau) ** 2, 60 * tau * (1 - tau) * (1 - 2 * tau)
-    return tau**3 * (10 - 15 * tau + 6 * tau**2), first, second
-
-
-def _rates(curve: PathCurve, tau: float) -> tuple[Array, Array, Array]:
-    """Return posture, velocity and acceleration of the motion with a duration of 1 s."""
-    s, ds, dds = (float(x) for x in _law(np.array(tau)))
-    v = curve.velocity(s)
-    return curve.posture(s), v * ds, curve.acceleration(s) * ds**2 + v * dds
+    return LimitUse(t, velocity, torque, thrust, largest)

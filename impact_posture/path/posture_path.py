@@ -15,6 +15,7 @@ from impact_posture.path.path_search import EFFORT, Connection, connect, shorten
 from impact_posture.path.path_space import PathSpace
 from impact_posture.path.path_timing import LimitUse, limit_use, timed
 from impact_posture.path.reachable_curve import ReachableCurve
+from impact_posture.path.row_interpolation import INTERPOLATION
 from impact_posture.posture.search.multistart import PostureSolution
 from impact_posture.system.arrays import Array
 
@@ -36,8 +37,9 @@ class PosturePath:
         method: Method of the search: ``continuation`` or ``sampling``; empty without a motion.
         timing: ``time-optimal``, ``scaled`` or ``slowed``; empty without a motion.
         objective: Objective at the end of the path.
-        t: Times, s, shape (n,); a single zero if the start is the end.
-        q: Postures on the constraints, shape (n, nq).
+        t: Times, s, shape (n,); a single zero if the start is the end.  Between them, the motion is a
+            :class:`~impact_posture.path.row_interpolation.RowInterpolation`.
+        q: Postures, shape (n, nq).
         v: Velocities ``ν``, shape (n, nv).
         a: Accelerations ``ν̇``, shape (n, nv).
         length: Tangent length of the path, rad mixed with m.
@@ -75,6 +77,7 @@ class PosturePath:
             "duration_s": self.duration,
             "length": self.length,
             "points": len(self.t),
+            "interpolation": INTERPOLATION,
             "max_violation": self.max_violation,
             "objective": self.objective,
             "q": self.q[-1].tolist(),
@@ -113,14 +116,13 @@ def posture_path(solution: PostureSolution, *, seed: int = 0, effort: int = EFFO
         return _still(space, objective, start, "no smooth curve through the path satisfies the constraints")
     limits = ActuatorLimits(objective, start, solution.problem.requirements)
     motion = timed(space, curve, limits)
-    q = np.array([space.projector.project(curve.at(z)).q for z in motion.z])
-    use = limit_use(space, motion, q, limits)
-    objectives = np.array([objective.value(q[k]) for k in np.searchsorted(motion.t, use.at)])
+    rows, use = motion.rows, limit_use(space, motion, limits)
+    objectives = np.array([objective.value(rows.at(t)[0]) for t in use.at])
     reason = "; ".join(filter(None, [failure, *motion.notes]))
-    end, length, violation = float(objective.value(q[-1])), space.length(list(q)), max(map(space.worst, q))
+    end, length, violation = float(objective.value(rows.q[-1])), space.length(rows.q), max(map(space.worst, rows.q))
     return PosturePath(
         not failure, reason, connection.method, motion.method, end,
-        motion.t, q, motion.v, motion.a, length, violation, use, objectives,
+        rows.t, rows.q, rows.v, rows.a, length, violation, use, objectives,
     )  # fmt: skip
 
 

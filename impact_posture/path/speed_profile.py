@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 
 from impact_posture.path.actuator_limits import ActuatorLimits
 from impact_posture.path.path_curve import PathCurve
 from impact_posture.path.path_space import PathSpace
-from impact_posture.path.timed_curve import SAMPLE_TIME, TimedCurve, times
+from impact_posture.path.time_law import stepped
+from impact_posture.path.timed_curve import SAMPLE_TIME, TimedCurve, sampled
 
 # Share of the limits that speed and acceleration may use together.
 _SHARE = 0.95
@@ -28,7 +27,7 @@ def slowed(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedC
     zero, speed = np.zeros(space.model.nv), space.problem.robot.velocity_limits
     most, steep = np.empty((2, len(s)))
     for k, place in enumerate(s):
-        q, v, a = curve.posture(place), curve.velocity(place), curve.acceleration(place)
+        q, v, a = curve.moment(place)
         rest = limits.load(q, zero, zero)
         push = limits.load(q, zero, v) - rest
         rates = [limits.largest_rate(q, rest, d) for d in (limits.load(q, v, a) - rest, push, -push)]
@@ -46,15 +45,4 @@ def slowed(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedC
         x[k] = min(x[k], x[k - 1] + reach[k - 1])
     for k in range(len(x) - 2, -1, -1):
         x[k] = min(x[k], x[k + 1] + reach[k])
-    rate = np.sqrt(x)
-    passed = [2 * d / (a + b) for d, (a, b) in zip(np.diff(s), pairwise(rate), strict=True)]
-    ends = np.concatenate([[0.0], np.cumsum(passed)])
-    t = times(float(ends[-1]))
-    part = np.clip(np.searchsorted(ends, t, side="right") - 1, 0, len(s) - 2)
-    dds = (np.diff(x) / (2 * np.diff(s)))[part]
-    ds = rate[part] + dds * (t - ends[part])
-    at = np.minimum(s[part] + (rate[part] + ds) / 2 * (t - ends[part]), 1.0)
-    along = np.array([curve.velocity(float(place)) for place in at])
-    bent = np.array([curve.acceleration(float(place)) for place in at])
-    v, a = along * ds[:, None], bent * ds[:, None] ** 2 + along * dds[:, None]
-    return TimedCurve(t, curve.spline(at), v, a, "slowed")
+    return sampled(space, curve, limits, stepped(s, np.sqrt(x)), "slowed")

@@ -1,36 +1,93 @@
-"""Motions along a curve: times, velocities and accelerations."""
+"""Motions along a curve as rows that are dense enough for the interpolation between them."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain, pairwise
 
 import numpy as np
 
+from impact_posture.path.actuator_limits import ActuatorLimits
+from impact_posture.path.path_curve import PathCurve
+from impact_posture.path.path_space import PathSpace
+from impact_posture.path.row_interpolation import Moment, RowInterpolation
+from impact_posture.path.time_law import DIGITS, TimeLaw
 from impact_posture.system.arrays import Array
 
-# Largest time between two points of a trajectory, s, and the least number of points.
+# Largest time between two rows, s, and the least number of rows.
 SAMPLE_TIME, _LEAST_POINTS = 0.01, 21
+# Places between two rows where their interpolation is compared with the motion, as shares of the time between them.
+BETWEEN = (0.2, 0.5, 0.8)
+# Largest difference of a load there, as a share of its limit, and how often the time between two rows may be cut.
+_DIFFERENCE, _CUTS = 0.004, 10
+# A load without a limit is compared with its largest value, or with this share of the largest load.
+_SMALL = 0.01
+
+Row = tuple[float, Moment]
 
 
 @dataclass(frozen=True, eq=False)
 class TimedCurve:
-    """A motion along a curve: times, s, shape (n,), velocities ``ν`` and accelerations ``ν̇``, shape (n, nv).
+    """A motion along a curve.
 
     Attributes:
-        z: Tangent coordinates on the curve, shape (n, nv).
+        rows: Rows on the curve, and the motion between them.
         method: ``time-optimal`` (fixed base), ``scaled`` (one time scale for the whole motion) or ``slowed`` (slower
             at corners of the curve).
         notes: Limits that the motion does not respect, and why.
     """
 
-    t: Array
-    z: Array
-    v: Array
-    a: Array
+    rows: RowInterpolation
     method: str
     notes: tuple[str, ...] = ()
 
+    @property
+    def instants(self) -> Array:
+        """Times of the rows and of places between them, s, for the check of limits."""
+        return np.append(np.concatenate([a + (b - a) * np.array([0.0, *BETWEEN]) for a, b in pairwise(self.rows.t)]),
+                         self.rows.t[-1])  # fmt: skip
 
-def times(duration: float) -> Array:
-    """Return the times of a trajectory, evenly from zero, s."""
-    return np.linspace(0.0, duration, max(_LEAST_POINTS, int(np.ceil(duration / SAMPLE_TIME)) + 1))
+
+def moment(curve: PathCurve, law: TimeLaw, t: float) -> Moment:
+    """Return posture, velocity and acceleration of the motion along a curve at a time."""
+    s, ds, dds = (float(x[0]) for x in law.at(np.array([t])))
+    q, along, bent = curve.moment(s)
+    return q, along * ds, bent * ds**2 + along * dds
+
+
+def sampled(
+    space: PathSpace, curve: PathCurve, limits: ActuatorLimits, law: TimeLaw, method: str, notes: tuple[str, ...] = ()
+) -> TimedCurve:
+    """Return the motion along a curve with a time law.
+
+    The rows are at most :data:`SAMPLE_TIME` apart.  There are more where the acceleration bends, and where the
+    interpolation needs other loads than the motion.
+    """
+    step = min(SAMPLE_TIME, law.duration / (_LEAST_POINTS - 1))
+    t = np.linspace(0.0, law.duration, int(np.ceil(law.duration / step - 1e-9)) + 1).round(DIGITS)
+    bends, first = law.bends, [moment(curve, law, time) for time in t]
+    effort, most = np.array(space.model.effortLimit), np.abs([limits.load(*each) for each in first]).max(axis=0)
+    scale = np.where(np.isfinite(effort) & (effort > 0), effort, np.maximum(most, _SMALL * most.max()))
+
+    def rows(start: Row, end: Row, cuts: int) -> Iterator[Row]:
+        """Yield the first row and those between it and the next."""
+        (a, _), (b, _) = start, end
+        pair, times = _joined(space, [start, end]), a + (b - a) * np.array(BETWEEN)
+        differences = [limits.load(*pair.at(time)) - limits.load(*moment(curve, law, time)) for time in times]
+        if not cuts or (np.abs(differences) / scale).max() < _DIFFERENCE:
+            yield start
+            return
+        inside = bends[(bends > a) & (bends < b)]
+        cut = float(inside[np.abs(inside - times[1]).argmin()]) if inside.size else round(float(times[1]), DIGITS)
+        middle = cut, moment(curve, law, cut)
+        yield from rows(start, middle, cuts - 1)
+        yield from rows(middle, end, cuts - 1)
+
+    pieces = [rows(start, end, _CUTS) for start, end in pairwise(zip(t.tolist(), first, strict=True))]
+    return TimedCurve(_joined(space, [*chain(*pieces), (t[-1], first[-1])]), method, notes)
+
+
+def _joined(space: PathSpace, rows: Sequence[Row]) -> RowInterpolation:
+    q, v, a = (np.array([each[k] for _, each in rows]) for k in range(3))
+    return RowInterpolation(space.model, np.array([t for t, _ in rows]), q, v, a)

@@ -24,7 +24,9 @@ from tests.support.helpers import robot
 from tests.support.settings import make_settings
 
 FAST = ("--starts", "2", "--jobs", "1", "--no-codegen", "--format", "png")
-BLOCK = set("found reason method timing duration_s length points max_violation objective q limits".split())
+BLOCK = set(
+    "found reason method timing duration_s length points interpolation max_violation objective q limits".split()
+)
 LIMITS = {"velocity", "velocity_of", "torque", "torque_of", "thrust", "thrust_of", "active"}
 
 

@@ -1,13 +1,17 @@
-"""Timed paths: analytic durations, torque limits by RNEA at ten times the resolution, feasible contact forces."""
+"""Timed paths: analytic durations, torque limits by RNEA between the rows, feasible contact forces."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 import pytest
+import yaml
+from scipy.interpolate import BPoly
 from scipy.optimize import lsq_linear
 
 from impact_posture.impact.impact_contact import ImpactContact
@@ -16,8 +20,11 @@ from impact_posture.path import path_timing as timing
 from impact_posture.path import timed_curve
 from impact_posture.path.actuator_limits import ActuatorLimits
 from impact_posture.path.path_curve import PathCurve
+from impact_posture.path.path_files import write_path
 from impact_posture.path.path_space import PathSpace
 from impact_posture.path.posture_path import PosturePath, posture_path
+from impact_posture.path.row_interpolation import RowInterpolation
+from impact_posture.path.time_law import RAMP
 from impact_posture.posture.constraints.requirements import Requirements
 from impact_posture.posture.formulation.build_problem import build_problem
 from impact_posture.posture.formulation.problem_file import prepare
@@ -27,7 +34,7 @@ from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_spec import RobotSpec
 from impact_posture.system.arrays import Array
 from tests.support.arms import TIP, Z, arm, yaw_and_pitches
-from tests.support.helpers import robot
+from tests.support.helpers import rng, robot
 from tests.support.settings import make_settings
 
 CASES: dict[str, dict[str, object]] = {
@@ -44,41 +51,41 @@ def solved(name: str) -> PostureSolution:
 
 
 @pytest.fixture(params=CASES, scope="module")
-def dense(request: pytest.FixtureRequest) -> tuple[Robot, PosturePath]:
-    """The same timed path at ten times the resolution."""
+def moments(request: pytest.FixtureRequest) -> tuple[Robot, PosturePath, list[tuple[float, Array, Array, Array]]]:
+    """A timed path, and its motion at ten places from row to row."""
     solution = solved(request.param)
-    coarse = posture_path(solution)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(timed_curve, "SAMPLE_TIME", timed_curve.SAMPLE_TIME / 10)
-        patch.setattr(timed_curve, "_LEAST_POINTS", 10 * timed_curve._LEAST_POINTS)
-        fine = posture_path(solution)
-    assert fine.found and fine.duration == pytest.approx(coarse.duration, rel=1e-9)
-    assert len(fine.t) >= 9 * len(coarse.t)
-    return solution.problem.robot, fine
+    path = posture_path(solution)
+    rows = RowInterpolation(solution.problem.robot.model, path.t, path.q, path.v, path.a)
+    t = np.append(np.concatenate([np.linspace(a, b, 10, endpoint=False) for a, b in pairwise(path.t)]), path.t[-1])
+    return solution.problem.robot, path, [(time, *rows.at(time)) for time in t]
 
 
-def test_positions_velocities_and_accelerations_agree(dense: tuple[Robot, PosturePath]) -> None:
-    loaded, path = dense
-    dt = np.diff(path.t)[:, None]
-    steps = np.array([pin.difference(loaded.model, a, b) for a, b in zip(path.q, path.q[1:], strict=False)])
-    # Projection onto the constraints moves each posture by up to 1e-5.
-    assert np.abs(steps - dt * (path.v[1:] + path.v[:-1]) / 2).max() < 3e-5
-    # The time-optimal acceleration has jumps; between the jumps it is the slope of the velocity.
-    off = np.abs(np.diff(path.v, axis=0) / dt - (path.a[1:] + path.a[:-1]) / 2).max(axis=1)
-    assert np.median(off) < 0.01 * np.abs(path.a).max()
-    assert np.abs(path.v[[0, -1]]).max() < 1e-6
+def test_positions_velocities_and_accelerations_agree(
+    moments: tuple[Robot, PosturePath, list[tuple[float, Array, Array, Array]]],
+) -> None:
+    loaded, path, motion = moments
+    t, v, a = (np.array([each[k] for each in motion]) for k in (0, 2, 3))
+    dt = np.diff(t)[:, None]
+    steps = np.array([pin.difference(loaded.model, one[1], other[1]) for one, other in pairwise(motion)])
+    assert np.abs(steps - dt * (v[1:] + v[:-1]) / 2).max() < 1e-6
+    off = np.abs(np.diff(v, axis=0) / dt - (a[1:] + a[:-1]) / 2)
+    assert off.max() < 0.01 * np.abs(path.a).max()
+    assert np.abs(path.v[[0, -1]]).max() < 1e-12
 
 
-def test_limits_hold_at_ten_times_the_resolution(dense: tuple[Robot, PosturePath]) -> None:
+def test_limits_hold_at_the_rows_and_between_them(
+    moments: tuple[Robot, PosturePath, list[tuple[float, Array, Array, Array]]],
+) -> None:
     """The oracle is RNEA on the robot's model, with contact forces as sums of friction cone rays."""
-    loaded, path = dense
+    loaded, path, motion = moments
     model, data = loaded.model, loaded.model.createData()
     base = 6 if loaded.floating else 0
     allowed = 1.01
-    assert (np.abs(path.v) / allowed <= np.asarray(model.velocityLimit)).all()
+    fastest = max(float((np.abs(v) / model.velocityLimit).max()) for _, _, v, _ in motion)
+    assert fastest <= allowed
     assert path.max_violation < 1e-8
     effort, largest = np.asarray(model.effortLimit)[base:], 0.0
-    for q, v, a in list(zip(path.q, path.v, path.a, strict=True))[:: 1 if not base else 7]:
+    for _, q, v, a in motion[:: 1 if not base else 7]:
         load = np.array(pin.rnea(model, data, q, v, a))
         if not base:
             assert (np.abs(load) <= allowed * effort).all()
@@ -93,7 +100,53 @@ def test_limits_hold_at_ten_times_the_resolution(dense: tuple[Robot, PosturePath
         assert np.abs(fit.fun).max() < 1e-5 * loaded.mass * 9.81
     if not base:
         # A timed path is as fast as possible if it reaches a limit at all times.
-        assert max(largest, float((np.abs(path.v) / model.velocityLimit).max())) > 0.98
+        assert max(largest, fastest) > 0.98
+        # The shares in the files are those between the rows, too.
+        assert path.use is not None and path.use.largest["torque"] == pytest.approx(largest, abs=2e-3)
+
+
+@pytest.mark.parametrize("name", ["ur5", "xarm7"])
+@pytest.mark.parametrize("normal", [(0, 0, 1), (-1, 0, 0)])
+def test_limits_hold_for_the_trajectory_as_a_robot_interpolates_it(
+    name: str, normal: tuple[float, ...], tmp_path: Path
+) -> None:
+    """The file names quintic polynomials. SciPy builds them, and RNEA by Pinocchio gives their torques."""
+    task = {"robot": name, "normal": normal, "contact_pose": "position"}
+    solution = solve(prepare(make_settings(task)).problem, starts=4, jobs=1)
+    loaded, path = solution.problem.robot, posture_path(solution)
+    write_path(tmp_path, loaded, path)
+    text = (tmp_path / "path.yaml").read_text()
+    assert "Interpolation: quintic" in text and path.to_dict()["interpolation"] == "quintic"
+    points = yaml.safe_load(text)["points"]
+    t = np.array([p["time_from_start"]["sec"] + 1e-9 * p["time_from_start"]["nanosec"] for p in points])
+    rows = np.array([[p["positions"], p["velocities"], p["accelerations"]] for p in points])
+    q = BPoly.from_derivatives(t, rows)
+    v, a = q.derivative(), q.derivative(2)
+    data, largest = loaded.model.createData(), 0.0
+    for time in np.concatenate([np.linspace(a, b, 20, endpoint=False) for a, b in pairwise(t)]):
+        load = pin.rnea(loaded.model, data, q(time), v(time), a(time))
+        largest = max(largest, float((np.abs(load) / loaded.model.effortLimit).max()))
+        assert (np.abs(v(time)) <= 1.01 * loaded.model.velocityLimit).all()
+    assert 0.9 < largest <= 1.01
+    # Rows are added at the bends alone.
+    assert len(t) < 2.5 * path.duration / timed_curve.SAMPLE_TIME
+
+
+def test_the_motion_between_rows_of_a_floating_base_has_the_twist_of_its_postures() -> None:
+    """The rows are those of ``q(t) = q₀ ⊕ t ν₀`` with ``t ↦ t + t²``, whose twist and acceleration are known."""
+    model, h = robot("tilthex_arm").model, 1e-6
+    start, twist = robot("tilthex_arm").posture(), rng("twist").normal(size=model.nv)
+    t = np.linspace(0.0, 0.02, 3)
+    q = np.array([pin.integrate(model, start, (x + x**2) * twist) for x in t])
+    rows = RowInterpolation(model, t, q, np.outer(1 + 2 * t, twist), np.outer(np.full(3, 2.0), twist))
+    for time in np.linspace(1e-3, 0.019, 10):
+        posture, v, a = rows.at(time)
+        exact = pin.integrate(model, start, (time + time**2) * twist)
+        assert np.abs(pin.difference(model, exact, posture)).max() < 1e-12
+        between = pin.difference(model, rows.at(time - h)[0], rows.at(time + h)[0]) / (2 * h)
+        np.testing.assert_allclose(v, between, atol=1e-8)
+        np.testing.assert_allclose(v, (1 + 2 * time) * twist, atol=1e-10)
+        np.testing.assert_allclose(a, 2 * twist, atol=1e-6)
 
 
 def forces(loaded: Robot, q: Array) -> tuple[Array, Array, Array]:
@@ -133,21 +186,20 @@ def curve_of(space: PathSpace, angle: float) -> PathCurve:
 
 @pytest.mark.parametrize(("effort", "angle"), [(0.5, 1.0), (2.0, -0.7)])
 def test_a_pendulum_has_the_duration_of_bang_bang_control(effort: float, angle: float) -> None:
-    """T = 2 √(I Δ/τ) for bang-bang torque.  With the smooth law, the largest acceleration is 10/√3 Δ/T²."""
+    """T = 2 √(I Δ/τ) for bang-bang torque, plus the ramp.  The smooth law accelerates with up to 10/√3 Δ/T²."""
     space = pendulum(effort)
     inertia = float(pin.crba(space.model, space.model.createData(), space.problem.given)[0, 0])
     limits = limits_of(space)
     assert not limits.missing
     fastest = timing.timed(space, curve_of(space, angle), limits)
     assert fastest.method == "time-optimal" and not fastest.notes
-    assert fastest.t[-1] == pytest.approx(2 * np.sqrt(inertia * abs(angle) / effort), rel=5e-3)
+    assert fastest.rows.t[-1] == pytest.approx(2 * np.sqrt(inertia * abs(angle) / effort) + RAMP, rel=1e-4)
     smooth = timing.scaled(space, curve_of(space, angle), limits)
-    assert smooth.t[-1] == pytest.approx(np.sqrt(10 / np.sqrt(3) * inertia * abs(angle) / effort), rel=5e-3)
+    assert smooth.rows.t[-1] == pytest.approx(np.sqrt(10 / np.sqrt(3) * inertia * abs(angle) / effort), rel=5e-3)
 
 
 @pytest.mark.parametrize("name", ["panda", "tilthex_arm"])
-def test_a_motion_is_slow_only_at_a_corner(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(timed_curve, "SAMPLE_TIME", timed_curve.SAMPLE_TIME / 10)
+def test_a_motion_is_slow_only_at_a_corner(name: str) -> None:
     loaded = robot(name)
     objective = WorstCaseObjective(loaded, ImpactContact(loaded.spec.contact.frame, (0, 0, 1)))
     space = PathSpace(build_problem(loaded, objective, loaded.posture(), Requirements(contact_pose="free")))
@@ -159,15 +211,14 @@ def test_a_motion_is_slow_only_at_a_corner(name: str, monkeypatch: pytest.Monkey
     motion = timing.timed(space, curve, limits_of(space))
     assert motion.method == "slowed" and not motion.notes
     limits, largest = limits_of(space), 0.0
-    for z, v, a in zip(motion.z, motion.v, motion.a, strict=True):
-        q = curve.at(z)
+    for q, v, a in map(motion.rows.at, motion.instants):
         shares = limits.shares(q, limits.load(q, v, a))
         assert shares is not None
         largest = max(largest, float(np.abs(shares).max()), float((np.abs(v) / loaded.velocity_limits).max()))
     assert 0.5 < largest < 1.0
     # The motion is much faster on straight parts of the curve than at its corner.
-    slow = np.linalg.norm(motion.z - curve.z[48], axis=1).argmin()
-    assert np.abs(motion.v[slow]).max() < 0.3 * np.abs(motion.v).max()
+    slow = np.argmin([space.distance(q, curve.at(curve.z[48])) for q in motion.rows.q])
+    assert np.abs(motion.rows.v[slow]).max() < 0.3 * np.abs(motion.rows.v).max()
 
 
 def test_without_a_torque_limit_only_velocities_count() -> None:
@@ -178,8 +229,8 @@ def test_without_a_torque_limit_only_velocities_count() -> None:
         "no effort limit of a joint is known: timed by velocities alone",
     )
     # The joint may turn at 10 rad/s.  The smooth law reaches its maximum speed of 15/8 Δ/T in the middle.
-    assert np.abs(motion.v).max() == pytest.approx(10.0, rel=1e-3)
-    assert motion.t[-1] == pytest.approx(15 / 8 / 10.0, rel=1e-3)
+    assert np.abs(motion.rows.v).max() == pytest.approx(10.0, rel=1e-3)
+    assert motion.rows.t[-1] == pytest.approx(15 / 8 / 10.0, rel=1e-3)
 
 
 def test_the_known_torque_limits_count_beside_an_unknown_limit() -> None:
@@ -194,7 +245,7 @@ def test_the_known_torque_limits_count_beside_an_unknown_limit() -> None:
     assert limits.names == ("joint_0",) and not limits.missing
     fastest = timing.timed(space, curve, limits)
     assert fastest.method == "time-optimal"
-    assert fastest.t[-1] == pytest.approx(2 * np.sqrt(inertia / 0.5), rel=5e-3)
+    assert fastest.rows.t[-1] == pytest.approx(2 * np.sqrt(inertia / 0.5), rel=5e-3)
 
 
 def test_a_posture_that_the_motor_cannot_hold_is_named() -> None:

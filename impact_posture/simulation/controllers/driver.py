@@ -8,6 +8,7 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.path.posture_path import PosturePath
+from impact_posture.path.row_interpolation import RowInterpolation
 from impact_posture.simulation.controllers.compiled_tick import CompiledTick
 from impact_posture.simulation.controllers.contact_reference import ReferencePoint
 from impact_posture.simulation.controllers.task_formulations import build_formulation, end_effector_task
@@ -184,9 +185,8 @@ class PostureDriver(Driver):
 class PathDriver(Driver):
     """Nominal controller whose posture follows a timed path after :meth:`brace`.
 
-    Between two points of the path, the posture is interpolated on the configuration manifold.  Velocity and
-    acceleration are interpolated linearly.  The targets of center of mass and base orientation follow from the
-    posture.
+    Between two rows of the path, the motion is the quintic polynomial that its files name.  The targets of
+    center of mass and base orientation follow from the posture.
 
     Attributes:
         path: Path to the offline optimum, from the start posture or the nearest posture that satisfies the
@@ -196,6 +196,7 @@ class PathDriver(Driver):
     def __init__(self, setup: Setup, posture: JointPosture, path: PosturePath) -> None:
         super().__init__(setup, posture)
         self.path = path
+        self._motion = RowInterpolation(setup.robot.model, path.t, path.q, path.v, path.a)
         self._since: float | None = None
         self._body = BodyTaskLead(setup.robot.model)
 
@@ -215,10 +216,7 @@ class PathDriver(Driver):
             if self._since >= path.duration:
                 q, v, a = path.q[-1], np.zeros(model.nv), np.zeros(model.nv)
             else:
-                k = int(np.searchsorted(path.t, self._since, side="right")) - 1
-                share = (self._since - path.t[k]) / (path.t[k + 1] - path.t[k])
-                q = np.asarray(pin.interpolate(model, path.q[k], path.q[k + 1], share))
-                v, a = ((1 - share) * x[k] + share * x[k + 1] for x in (path.v, path.a))
+                q, v, a = self._motion.at(self._since)
             self.posture.lead(q, v, a)
             self._body.lead(self._body_tasks, q, v, a)
         super().lead(t, reference)

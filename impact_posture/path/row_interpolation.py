@@ -1,0 +1,54 @@
+"""The motion between the rows of a path: quintic polynomials, as ROS interpolates a ``JointTrajectory``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.system.arrays import Array
+
+# Name of the interpolation in files.
+INTERPOLATION = "quintic"
+
+# Posture, velocity and acceleration.
+Moment = tuple[Array, Array, Array]
+
+
+@dataclass(frozen=True, eq=False)
+class RowInterpolation:
+    """The motion that has the positions, velocities and accelerations of rows, by a polynomial of degree 5 per row.
+
+    The polynomial belongs to the tangent coordinates at the row before.  For a joint of one axis, these are its angle
+    or travel.
+
+    Attributes:
+        t: Times of the rows, s, shape (n,).
+        q: Postures, shape (n, nq).
+        v: Velocities ``ν``, shape (n, nv).
+        a: Accelerations ``ν̇``, shape (n, nv).
+    """
+
+    model: pin.Model
+    t: Array
+    q: Array
+    v: Array
+    a: Array
+
+    def at(self, t: float) -> Moment:
+        """Return posture, velocity and acceleration at a time; outside the rows, those of the nearest row."""
+        k = int(np.clip(np.searchsorted(self.t, t, side="right") - 1, 0, len(self.t) - 2))
+        start, end, h = self.q[k], self.q[k + 1], self.t[k + 1] - self.t[k]
+        u = float(np.clip((t - self.t[k]) / h, 0.0, 1.0))
+        turn = pin.dDifference(self.model, start, end, pin.ARG1)
+        # The change of this matrix is of second order in the step, and zero for joints of one axis.
+        v, a = self.v[k] * h, self.a[k] * h**2
+        gap = np.array(pin.difference(self.model, start, end)) - v - a / 2
+        speed, bend = h * (turn @ self.v[k + 1]) - v - a, h**2 * (turn @ self.a[k + 1]) - a
+        c = [10 * gap - 4 * speed + bend / 2, -15 * gap + 7 * speed - bend, 6 * gap - 3 * speed + bend / 2]
+        z = u * (v + u * (a / 2 + u * (c[0] + u * (c[1] + u * c[2]))))
+        dz = v + u * (a + u * (3 * c[0] + u * (4 * c[1] + u * 5 * c[2])))
+        ddz = a + u * (6 * c[0] + u * (12 * c[1] + u * 20 * c[2]))
+        back = pin.dIntegrate(self.model, start, z, pin.ARG1)
+        return np.array(pin.integrate(self.model, start, z)), back @ dz / h, back @ ddz / h**2
