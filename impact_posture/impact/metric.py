@@ -26,12 +26,12 @@ class Metric:
 
     Attributes:
         kind: ``euclidean`` (W = I), ``kinetic`` (W = M) or ``weighted`` (``W`` diagonal).
-        weights: Diagonal of ``W`` for the kind ``weighted``, shape (nv,); ``None`` for the other kinds.
+        weights: Diagonal of ``W`` for a ``weighted`` metric, shape (nv,); ``None`` otherwise.
         source: Text that states where the weights come from.
 
     Raises:
-        InputError: The kind is unknown, or a weight is not above zero.
-        MetricError: The kind is ``weighted`` and weights are missing, or another kind has weights.
+        InputError: ``kind`` is unknown, or a weight is not above zero.
+        MetricError: A ``weighted`` metric has no weights, or another metric has weights.
     """
 
     kind: MetricKind = "euclidean"

@@ -57,7 +57,8 @@ class Minimized(Protocol):
         """Return gradients that span the subdifferential at ``q``, computed with Pinocchio.
 
         If the value is smooth at ``q``, the result is one gradient.  If the value is a maximum of functions, the
-        result has the gradient of every function that is at most ``within`` below the maximum, the largest first.
+        result starts with the gradient of the largest function.  The gradients of all functions that are at most
+        ``within`` below the maximum follow.
         """
 
     def lift(self, tree: Tree, parameters: ca.SX, scale: ca.SX) -> Lifted:
@@ -106,7 +107,7 @@ class Objective(Minimized, Protocol):
 
     @property
     def parameters(self) -> Array:
-        """Parameters of the lifted form, shape (k,), which can change without rebuilding the program."""
+        """Argument ``parameters`` of :meth:`lift`, shape (k,), which can change without rebuilding the program."""
 
     def movable(self, q: Array) -> bool:
         """Return whether the contact can move at ``q``; if it cannot, the value is only a rounding error."""

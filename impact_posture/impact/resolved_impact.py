@@ -206,7 +206,7 @@ def missing_support(robot: Robot) -> str:
         return ""
     guessed = feet(robot)
     named = " ".join(f"`support` {frame}" for frame in guessed)
-    stand = f"{named} (its feet by name or geometry)" if guessed else "`support` FRAME for each foot"
+    stand = f"{named} (feet guessed from names or geometry)" if guessed else "`support` FRAME for each foot"
     draft = "(inspect --write-robot-toml drafts one)"
     return f"give {stand}, no `support` if the robot really floats, `base`, or a robot.toml {draft}"
 

@@ -24,7 +24,7 @@ ACTIVE = 1e-6
 class ModelSet:
     """The largest objective over several robot models.
 
-    Let ``f_k`` be the objective for the k-th model.  The problem ``min_q max_k f_k(q)`` becomes ``min t`` with ``t ≥
+    With the objective ``f_k`` of the k-th model, the problem ``min_q max_k f_k(q)`` becomes ``min t`` with ``t ≥
     f_k(q)`` for all k.  Models between the variants are not included;
     :mod:`impact_posture.posture.analysis.robustness` samples them.  ``members`` contains the worst case for each
     model, first for the nominal model.
@@ -77,7 +77,7 @@ class ModelSet:
 
 
 def finite_maximum(values: Array, within: float = 0.0) -> tuple[NDArray[np.int_], Array]:
-    """Return the indices of the largest values, and the gap between each of them and the largest value.
+    """Return the indices of values near the largest value, and how far below the largest value they are.
 
     A value is included if it is at most ``within``, or the fraction :data:`ACTIVE`, below the largest value.  The
     index of the largest value comes first.

@@ -138,8 +138,8 @@ class HeldPose(ExpressionConstraint):
 class AxisInCone(ExpressionConstraint):
     """An axis of the frame stays within a cone, ``−dᵀR(q)c ≤ −cos α``, and the frame may turn about this axis.
 
-    ``axis`` is the unit vector ``c`` in the frame, ``direction`` the axis ``d`` of the cone in the world, shape (3,)
-    each, and ``degrees`` the half angle α of the cone.  ``point`` is a point on the link of the frame.
+    ``axis`` is the unit vector ``c`` in the frame, shape (3,).  ``direction`` is the axis ``d`` of the cone in the
+    world, shape (3,).  ``degrees`` is the half angle α of the cone.  ``point`` is a point on the link of the frame.
     """
 
     def __init__(self, name: str, point: PointOnLink, axis: Array, direction: Array, degrees: float) -> None:

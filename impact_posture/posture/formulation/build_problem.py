@@ -127,7 +127,7 @@ def _surroundings(
 ) -> Surroundings:
     """Return the bodies that the links must not touch.
 
-    A contact with a free pose has no surface, because an object pushes the robot there.
+    A contact whose pose is free has no surface, because there an object hits the robot.
     """
     around = Surroundings(objective.robot, numeric, requirements.hold, requirements.clearance)
     touching = [contact for contact, mode in struck if mode != "free"]

@@ -231,7 +231,7 @@ def _armature_by_joint(impact: ResolvedImpact) -> str | dict[str, float]:
 
 
 def dump_settings(settings: ProblemSettings) -> str:
-    """Write settings as TOML in the order of the fields, without ``None``; raise ``SpecError`` if not UTF-8."""
+    """Write settings as TOML, without ``None``; raise ``SpecError`` if a value is not UTF-8."""
     lines = [f"schema = {toml(settings.schema)}"]
     # Write the robot first, because readers look for it first.
     for key in sorted((field.name for field in fields(ProblemSettings)), key=lambda name: name != "robot"):

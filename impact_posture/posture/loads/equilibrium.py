@@ -48,8 +48,8 @@ class Distribution:
 class Thrusts:
     """Thrusts ``u = P τ_base`` of the rotors ``names``, determined by the wrench on the base, and their limits.
 
-    ``matrix`` is ``P`` in N per N and N·m, shape (k, 6).  ``lower`` and ``upper`` are the limits of the thrusts, N,
-    shape (k,).
+    ``matrix`` is ``P``, shape (k, 6), which maps a wrench (N, N·m) to thrusts (N).  ``lower`` and ``upper`` are the
+    limits of the thrusts, N, shape (k,).
     """
 
     names: tuple[str, ...] = ()
@@ -129,7 +129,7 @@ class Equilibrium:
         return self._even[1] <= 1 - room
 
     def _even_share(self, q: Array) -> float:
-        """Return the largest share of a limit at nearly even forces; infinite if the base is not balanced."""
+        """Return the largest actuator share at nearly even forces; infinite if the base is not balanced."""
         still = self.load.torque(q, np.zeros(self.load.count), by_posture=False)
         A, b, S, c = self._affine(still.value, still.by_force)
         lower, upper = self.load.lower, self.load.upper

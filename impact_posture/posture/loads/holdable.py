@@ -75,7 +75,7 @@ class Holdable(Constraint):
         return np.append(forces.unbalanced, shares), forces.jacobian
 
     def value(self, model: Numeric) -> Array:
-        """Return ``c(q)``, or zeros if nearly even forces already hold the posture."""
+        """Return ``c(q)``, or zeros if nearly even forces (:meth:`Equilibrium.spares`) hold the posture."""
         return np.zeros(self.rows) if self._rest.spares(model.q, 0.0) else self.evaluate(model)[0]
 
     def grown(self, model: Numeric, auxiliaries: Array | None = None) -> Self:
@@ -114,7 +114,7 @@ class Holdable(Constraint):
         """Return the rows of :meth:`lift` and the bounds of the forces.
 
         If the program lacks the rows of this constraint, the forces that minimize the largest share are used.  If
-        nearly even forces stay away from all limits, no rows are returned.
+        nearly even forces (:meth:`Equilibrium.spares`) stay away from all limits, no rows are returned.
         """
         rest, load, z = self._rest, self._rest.load, auxiliaries
         if not self.active:
