@@ -1,4 +1,4 @@
-"""Typer app with the subcommands of ``impact-posture``.  A call imports only the module of the called subcommand."""
+"""Typer app with the subcommands of ``impact-posture``.  It imports only the module of the called subcommand."""
 
 from __future__ import annotations
 
@@ -24,10 +24,7 @@ def build(name: str) -> Any:
 
 
 class CommandGroup(TyperGroup):
-    """Group of subcommands that builds the parser of the called subcommand only.
-
-    The help page uses only the names and texts in :data:`COMMANDS`.
-    """
+    """Group of subcommands.  It builds only the parser of the called subcommand, so that ``--help`` stays fast."""
 
     def __init__(self, **attributes: Any) -> None:
         super().__init__(**attributes)
@@ -63,4 +60,4 @@ def root(
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
     ] = False,
 ) -> None:
-    """Read the options that are given before a subcommand."""
+    """Define the options of ``impact-posture`` itself, without a subcommand."""

@@ -1,4 +1,4 @@
-"""Convert arguments of the command line to a form that Typer can read."""
+"""Rewrite arguments of the command line into a form that Typer can read."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ import re
 from collections.abc import Sequence
 from itertools import zip_longest
 
-# Options whose value may be missing, and the pattern that a value matches.
+# Options whose value may be omitted.  The next argument is the value if it matches the pattern.
 _OPTIONAL = {
-    # Match any number, because the option itself reports a fraction as an error.
+    # The pattern allows fractions, because the option itself reports them as an error.
     "--tradeoff": re.compile(r"[+-]?[0-9.]+$"),
     "--write-robot-toml": re.compile(r".*\.toml$"),
 }
 
 
 def put_right(arguments: Sequence[str]) -> list[str]:
-    """Return the arguments with two changes that Typer requires.
+    """Return the arguments with two changes.
 
-    ``--payload FRAME MASS`` becomes ``--payload FRAME:MASS``, because a repeatable option cannot have two values in
-    Typer.  Options in ``_OPTIONAL`` without a value get their default value, because Typer requires a value.
+    ``--payload FRAME MASS`` becomes ``--payload FRAME:MASS``, because a repeatable option of Typer cannot have two
+    values.  An option in ``_OPTIONAL`` without a value gets its default value, because Typer requires a value.
     """
     words, rest = [], list(arguments)
     while rest:
@@ -30,7 +30,7 @@ def put_right(arguments: Sequence[str]) -> list[str]:
     for word, following in zip_longest(words, words[1:], fillvalue=""):
         filled.append(word)
         if word in _OPTIONAL and not _OPTIONAL[word].match(following):
-            # Imported here, because --help does not need this module.
+            # Import the module here, so that --help stays fast.
             from impact_posture.config.problem_settings import TRADEOFF_POINTS
 
             filled.append(str(TRADEOFF_POINTS) if word == "--tradeoff" else "")

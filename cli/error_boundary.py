@@ -34,7 +34,7 @@ def run(command: Any, arguments: Sequence[str]) -> int:
     have their own exit code.  An error is written as one line to standard error.  With ``--json``, the error is also
     written as ``{"error": {code, kind, what, where, hint}}`` to standard output.
     """
-    # Hide the warning that Matplotlib logs if it cannot write to the folder of its cache.
+    # Hide the warning that Matplotlib logs if its cache folder is not writable.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
@@ -58,7 +58,7 @@ def run(command: Any, arguments: Sequence[str]) -> int:
         return error.code if isinstance(error.code, int) else 1
     except Exception as error:
         if isinstance(error, BrokenPipeError) or getattr(error, "errno", None) == errno.EPIPE:
-            # If the reader has closed the pipe, for example ``| head``, end without an error message.
+            # The reader has closed the pipe, for example ``| head``: end without an error message.
             _discard_output()
             return 1
         if os.environ.get(DEBUG_VARIABLE):
@@ -82,7 +82,7 @@ class _Fault:
 def _explain(error: Exception, arguments: Sequence[str]) -> _Fault:
     kind = type(error).__name__
     if isinstance(error, ImpactPostureError):
-        # If the place of the error is a parameter whose option is on the command line, write the option instead.
+        # If the error names a parameter, and its option is on the command line, name the option instead.
         option = f"--{error.where.partition(' ')[0].replace('_', '-')}"
         typed = any(word.partition("=")[0] == option for word in arguments)
         where = option + error.where[len(option) - 2 :] if typed else error.where
@@ -117,8 +117,8 @@ def _usage(error: Any, wants_json: bool) -> int:
 
 
 def _reword_choice(error: Any) -> None:
-    """Replace the message for an invalid choice by the message that keys of files have."""
-    # Typer offers no way to set this message. In all versions, the message contains the value and the choices.
+    """Replace the message of Typer for an invalid choice by the message for an invalid choice in a file."""
+    # Typer offers no way to set this message.  In all versions, the message contains the value and the choices.
     match = re.search(r"'(.*?)' is not one of ('.*)", str(getattr(error, "message", "")))
     if match:
         from impact_posture.errors import not_one_of

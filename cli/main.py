@@ -12,7 +12,7 @@ def main() -> None:
     prepare()
     if fault := memory_fault():
         sys.exit(refuse(fault))
-    # Imported after prepare(), so that a signal during these imports ends the process without a traceback.
+    # Import these modules after prepare(), so that a signal during the import ends the process without a traceback.
     import typer
 
     from impact_posture_cli.app import app

@@ -1,4 +1,4 @@
-"""Options of several commands, apart from the settings of a problem."""
+"""Options that several commands share.  Options for the settings of a problem are in ``settings_options.py``."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def option(names: str, panel: str, help: str, **more: Any) -> Any:
 
 def out_option(help: str, default: str = "") -> Any:
     """Return the option ``--out`` for the folder to write."""
-    # Shells do not expand the ~ in --out=~/result, so the program expands it.
+    # Expand ~ here, because shells do not expand it in --out=~/result.
     home = {"callback": lambda folder: folder and os.path.expanduser(folder)}
     return option("--out", OUTPUT, help, metavar="DIR", show_default=default or True, **home)
 

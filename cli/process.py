@@ -21,7 +21,7 @@ def prepare() -> None:
     _open_streams()
     # Always use the file backend, because a notebook backend or a missing backend in the environment would fail.
     os.environ["MPLBACKEND"] = "agg"
-    # The matrices are small, so threads of the linear algebra only use memory and can fail to start.
+    # Threads of the linear algebra do not help with small matrices, but they use memory and can fail to start.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     for number in _WORDS:
         # Signals that the parent ignores stay ignored, for example under nohup or in a background job of a shell.
@@ -32,7 +32,7 @@ def prepare() -> None:
 def finish(code: int) -> NoReturn:
     """End the process with an exit code.
 
-    Signals are ignored from now on, because the interpreter restores their default handlers while it ends.
+    Signals are ignored from now on.  Otherwise, a signal would have its default effect while the interpreter ends.
     """
     for number in _WORDS:
         signal.signal(number, signal.SIG_IGN)
@@ -51,7 +51,7 @@ def memory_fault() -> str:
 def _open_streams() -> None:
     """Open the null device for each closed standard stream.
 
-    Otherwise, a file that is opened later would become standard output.
+    Otherwise, the next opened file would get the descriptor of this stream, and output would be written into it.
     """
     for number in (0, 1, 2):
         try:
@@ -68,7 +68,7 @@ def _end(number: int, frame: object) -> None:
 
     After a second signal, end without cleaning up.
     """
-    # If the module is not completely imported yet, nothing has started that must be cleaned up.
+    # Before ``processes`` is imported, there is nothing to clean up.
     end_early = getattr(sys.modules.get("impact_posture.system.processes"), "end_early", None)
     leave = partial(_leave, number)
     if end_early is None or _SEEN:

@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import timedelta
 
-# Least time between two updates of the line, s.
+# Minimum time between two updates with the same text, s.
 _REFRESH = 0.1
-# Time after which the remaining time can be estimated, s.
+# The remaining time is estimated only after this time, s.
 _PACE = 2.0
 
 
@@ -37,8 +37,8 @@ def progress(
     from impact_posture.system.processes import undone
     from impact_posture.system.progress import listening
 
-    # No thread updates the line, because worker processes are forked during the block, and long calls of C code keep
-    # the lock of the Python interpreter.
+    # Do not update the line in a thread: worker processes are forked during the block, and long calls of C code block
+    # all Python threads.
     words = TextColumn("{task.description}", markup=False)
     columns = (words, BarColumn(), TextColumn("{task.fields[count]}"), TimeElapsedColumn())
     line = Progress(*columns, console=console, transient=True, auto_refresh=False)
@@ -71,7 +71,7 @@ def progress(
 
 
 def _time_left(took: float, done: int, left: int) -> str:
-    """Return a text with the remaining time, estimated from the speed so far, or an empty text if it is too early."""
+    """Return the remaining time as text, estimated from the speed so far; empty if an estimate is not possible."""
     if took < _PACE or not (done and left):
         return ""
     return f", {timedelta(seconds=math.ceil(took / done * left))} left"

@@ -26,7 +26,7 @@ NoSupport = Annotated[bool, typer.Option("--no-support", rich_help_panel=ROBOT, 
 
 @dataclass(frozen=True)
 class TypedSettings:
-    """Settings that are given on the command line, without defaults.
+    """Settings from the command line, without settings that have their default value.
 
     Attributes:
         context: Typer context of the command.
@@ -67,8 +67,8 @@ def with_settings(
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Return a decorator that adds an option for each setting to a command.
 
-    The settings ``without`` get no option. ``changed`` maps a setting to the annotation that its option has in this
-    command. The command is called with ``typed`` (:class:`TypedSettings`) and its own parameters.
+    Settings in ``without`` get no option.  ``changed`` maps the name of a setting to a different annotation of its
+    option.  The command is called with ``typed`` (:class:`TypedSettings`) and its own parameters.
     """
     options = _options(settings, without) | {name: (hint, None) for name, hint in changed.items()}
     if "support" in options:
@@ -103,7 +103,7 @@ def with_settings(
 
 
 def settings_of(settings: type[RobotSettings]) -> dict[str, Setting]:
-    """Return name → description of each field that has an option."""
+    """Return name → :class:`Setting` for each field of a settings class that has an option."""
     return {f.name: f.metadata["setting"] for f in fields(settings) if "setting" in f.metadata}
 
 
@@ -138,7 +138,7 @@ def _option_type(kind: Any, setting: Setting, optional: bool) -> Any:
 
 
 def demanding(annotation: Any, setting: Setting | None = None) -> Callable[[Any], Any]:
-    """Return a callback that checks the value of an option against the demands of an annotation."""
+    """Return a callback that checks the value of an option against the allowed values in an annotation."""
 
     def check(value: Any) -> Any:
         if value is not None and value != []:

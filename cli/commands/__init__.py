@@ -1,7 +1,7 @@
 """Subcommands of ``impact-posture``.  Each file reads options, calls the library, and prints the result.
 
-For a new subcommand, add a file with a function of the same name, and a row in :data:`COMMANDS`.  The function itself
-must import the library, so that ``--help`` stays fast.
+For a new subcommand, add a file with a function of the same name, and a row in :data:`COMMANDS`.  Import the library
+inside this function, so that ``--help`` stays fast.
 """
 
 from __future__ import annotations

@@ -101,8 +101,8 @@ def codegen(
 def _check_problem(typed: TypedSettings, robot: str) -> None:
     """Check that a contact is given.
 
-    If no contact is given and ``robot`` is a folder, the user means a result folder. The error then says what is
-    wrong with this folder.
+    If no contact is given and ``robot`` is a folder, the user probably means a result folder.  Then the error states
+    why this folder is not a result.
     """
     if not {"contact", "normal"} & typed.values.keys() and (os.path.isdir(robot) or robot.endswith(os.sep)):
         from impact_posture.output.result_reader import load_view
@@ -116,7 +116,7 @@ def _check_problem(typed: TypedSettings, robot: str) -> None:
 def _objectives(
     typed: TypedSettings, robot: str, from_result: bool
 ) -> tuple[list[WorstCaseObjective], Array | None, Compression | None, tuple[str, ...]]:
-    """Return the objectives, the optimum of a result, the first known contact compression, and warnings."""
+    """Return the objectives, the optimal posture of a result, the first known contact compression, and warnings."""
     if from_result:
         from impact_posture.output.result_reader import load_view
 
@@ -134,7 +134,7 @@ def _objectives(
 def _controller_parts(
     typed: TypedSettings, robot: str, kind: ControllerKind, flow: bool, scenario: str | None
 ) -> tuple[Robot, TaskFormulation, WorstCaseObjective | None]:
-    """Return the robot, its task formulation, and the objective of the posture task (``None``: no objective)."""
+    """Return the robot, its task formulation, and the objective that the posture task minimizes, if any."""
     if scenario is not None:
         from impact_posture.simulation.controllers.controller_factory import ControllerFactory
         from impact_posture.simulation.scenario_file import read_scenario

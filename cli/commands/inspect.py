@@ -80,8 +80,8 @@ def _write(robot: str, load: LoadOptions, out: str, *, force: bool, json: bool, 
 def _head(page: Page, summary: dict[str, Any]) -> None:
     contact, supports = summary["contact"], summary["supports"]
     page.title(summary["name"], summary["description"])
-    # With a fixed root, the mass excludes links that cannot move.  With this hint, users notice if they forgot
-    # `root = "free-flyer"`.
+    # With a fixed root, the mass excludes links that cannot move.  This text helps users who forgot
+    # ``root = "free-flyer"``.
     fixed = ", without what is fixed to the world" if summary["root"] == "fixed" else ""
     rows = [
         ("model", summary["source"]),

@@ -19,7 +19,7 @@ from impact_posture_cli.settings_options import TypedSettings, with_settings
 if TYPE_CHECKING:
     from impact_posture.output.result_folder import Written
 
-# High thresholds of the garbage collector, so that it rarely runs.
+# High thresholds, with which the garbage collector rarely runs.
 _RARELY = 200_000, 50, 100
 
 RobotOrProblem = Annotated[
@@ -45,7 +45,7 @@ def optimize(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    # Most objects are used until the result is printed, so garbage collection would only need time.
+    # Garbage collection would only take time, because most objects are in use until the result is printed.
     gc.set_threshold(*_RARELY)
     settings = _settings(robot, typed)
     _refuse_idle(typed, settings)
@@ -60,7 +60,7 @@ def optimize(
 
         check_package()
     page, shown = Page(quiet=quiet or json), not (quiet or json)
-    # For a large robot, fitting the collision shapes can take some seconds the first time.
+    # For a large robot, fitting the collision shapes takes several seconds, unless they are in the cache.
     with progress("preparing", "", shown=shown):
         prepared = prepare(settings)
     folder = Path(out) if out else default_out(prepared)
@@ -75,7 +75,7 @@ def optimize(
             compile=compile,
             search=settings.search,
             progress=advance,
-            # If no path reaches the best optimum, the next best optimum is used, so all starts must be finished.
+            # If no path reaches the best optimum, the next best optimum is used.  So the search needs all optima.
             finish_all=settings.finish_all or settings.path,
         )
     if settings.tradeoff:
@@ -85,7 +85,7 @@ def optimize(
         with progress("planning", "paths", shown=shown, first="searching a path to the optimum"):
             result = result.path(seed=settings.seed)
     if not json:
-        # Print the result before the figures and the C code are written, because this takes longer.
+        # Print the result first, because writing figures and C code takes longer.
         summarize(page, prepared, result.solution, result.document)
     with progress("drawing" if no_codegen else "drawing and compiling", "files", shown=shown) as advance:
         written = result.save(

@@ -26,12 +26,12 @@ def main() -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
     parser.add_argument("names", nargs="+", choices=list(STUDIES), metavar="NAME")
-    parser.add_argument("--only", default="", metavar="TEXT", help="cases whose name has this in it")
+    parser.add_argument("--only", default="", metavar="TEXT", help="run only cases whose name contains TEXT")
     parser.add_argument("--count", type=int, help="number of starts, ticks, passes, postures, draws or seeds")
-    parser.add_argument("--seed", type=int, default=0, help="of impacts and points; the first of four of flow")
-    parser.add_argument("--number", type=int, help="points: print this one alone, run anew")
-    parser.add_argument("--jobs", type=int, default=2, help="processes of points and reproduction")
-    parser.add_argument("--against", default="", metavar="PROGRAM", help="answer: another impact-posture")
+    parser.add_argument("--seed", type=int, default=0, help="seed of impacts and points; first of four seeds of flow")
+    parser.add_argument("--number", type=int, help="points: repeat and print only this point")
+    parser.add_argument("--jobs", type=int, default=2, help="number of processes for points and reproduction")
+    parser.add_argument("--against", default="", metavar="PROGRAM", help="answer: another impact-posture to compare")
     parser.add_argument("--write", action="store_true", help="also write the page in docs/generated")
     asked = parser.parse_args()
     wanted = [STUDIES[name] for name in asked.names]

@@ -15,12 +15,13 @@ from typing import NamedTuple
 
 from docs.studies.core import Request, machine, table
 
-# Goals on two idle cores with warm caches, s: time until the answer, and time until the end.
+# Name of a case → options of ``optimize``, and goals for the time until the printed answer and until the end, s (two
+# idle cores, warm caches).
 CASES = {
     "tilthex_arm": ("tilthex_arm --normal 0 0 1", 1.2, 2.5),
     "talos, hand": ("talos --frame gripper_right_base_link --normal -1 0 0", 2.5, 5.0),
 }
-# Text in the last line of the answer.
+# Text in the last line of the printed answer.
 _ANSWER = b"starts certified in"
 
 
@@ -35,7 +36,7 @@ class Run(NamedTuple):
 def lines(request: Request) -> Iterator[str]:
     """Yield a row for each case and program.
 
-    Runs of the programs alternate, because other work changes the times.
+    Runs of the programs alternate, so that other work on the machine affects all programs equally.
     """
     this = str(Path(sys.executable).with_name("impact-posture"))
     programs = {"this": this} | ({"other": request.against} if request.against else {})
@@ -61,9 +62,9 @@ def _rows(request: Request, programs: dict[str, str]) -> Iterator[list[str]]:
 
 
 def timed(command: list[str]) -> Run:
-    """Run a command in a new terminal, in a folder that is removed.
+    """Run a command in a new terminal.  Its output folder is temporary.
 
-    The command may write Python bytecode, because bytecode is a cache, too.
+    The command may write Python bytecode, as it would for a user.
     """
     ours, theirs = pty.openpty()
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}

@@ -1,4 +1,4 @@
-"""Approach speed of robots in the optimum, and increase of the objective if it must be as fast as in the start."""
+"""Attainable approach speed at the optimum, and how much a required approach speed increases the objective."""
 
 from __future__ import annotations
 

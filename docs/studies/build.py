@@ -23,7 +23,7 @@ _V3 = frozenset({"avx2", "bmi1", "bmi2", "f16c", "fma", "abm", "movbe"})
 
 @dataclass(frozen=True)
 class Built:
-    """Loaded library, its compiler command without header folders, and the processor time of the compiler, s."""
+    """Loaded library, its compiler command (without header folders), and the processor time of the compiler, s."""
 
     library: ctypes.CDLL
     flags: str

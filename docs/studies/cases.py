@@ -16,11 +16,11 @@ _STRUCK = {"contact": ("FL_FOOT:0,0,1", "HR_FOOT:0,0,1"), "support": ("FR_FOOT",
 
 @dataclass(frozen=True)
 class Case:
-    """Problem that ``impact-posture optimize ROBOT --normal …`` solves.
+    """Problem for ``impact-posture optimize``, with a name.
 
     Attributes:
         name: Name of the case in the tables.
-        robot: Name of a robot of the catalogue.
+        robot: Name of a robot from ``impact-posture robots``.
         normal: Contact normal in the world; ``None`` if ``more`` contains the contacts.
         more: Further keys of ``problem.toml``.
     """

@@ -1,7 +1,7 @@
-"""Compare the exported controller with the Python controller: equal answers, growth of memory, times of a tick.
+"""Compare the exported controller with the Python controller: equal commands, growth of memory, time of a tick.
 
-``python -m docs.studies.controller [TICKS] [equality|growth|times]`` writes one part or all parts into pages of the
-documentation.  Only the part ``times`` needs a quiet machine.
+``python -m docs.studies.controller [TICKS] [equality|growth|times]`` runs one part or all parts, and writes a page of
+the documentation for each part.  Only the part ``times`` needs an idle machine.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _HEAD = "<!-- Written by `make study-controller`; do not edit. -->"
 
 
 def quiet(name: str, ticks: int) -> tuple[list[Vector], list[float]]:
-    """Return the states of a robot at rest under the Python controller, and the times of the ticks, µs."""
+    """Return the states of a robot that the Python controller keeps at rest, and the time of each tick, µs."""
     robot, formulation = formulation_of(name)
     controller, recorded, taken = Controller(robot, formulation), list[Vector](), list[float]()
     q, v = robot.posture(), np.zeros(robot.nv)
@@ -54,7 +54,7 @@ def quiet(name: str, ticks: int) -> tuple[list[Vector], list[float]]:
 
 
 def flowing(name: str, ticks: int) -> tuple[Path, list[Vector]]:
-    """Return the folder of a controller with a reference flow, and the states of a robot under this controller."""
+    """Return the folder of an exported controller with a reference flow, and the states of a robot that it moves."""
     objective = objective_of(name)
     folder, robot = exported(name, objective, path=()), objective.robot
     controller, recorded = CompiledController.load(folder), list[Vector]()
@@ -69,16 +69,16 @@ def flowing(name: str, ticks: int) -> tuple[Path, list[Vector]]:
 
 
 def times(folder: Path, recorded: list[Vector], flags: list[str], cold: bool) -> tuple[float, float]:
-    """Return median and 99th percentile of the times of ticks, µs.
-
-    The time of a tick is the shortest time of its repetitions.
-    """
+    """Return median and 99th percentile of the times of ticks, µs.  Each time is the shortest of all repetitions."""
     least = _least(folder, recorded, flags, [["cold"] if cold else []])[0][:, 0]
     return float(np.median(least)), float(np.percentile(least, 99))
 
 
 def robust_over_nominal(name: str, frame: str, recorded: list[Vector]) -> list[str]:
-    """Return a row that compares nominal ticks with ticks that update the term at every tick or every fifth tick."""
+    """Return a table row with times of nominal ticks, and of ticks that update the impact-robust term.
+
+    The term is updated at every tick or at every fifth tick.
+    """
     robot = formulation_of(name)[0]
     folder = exported(name, impact_of(robot, frame, (0.0, 0.0, 1.0)))
     nominal, fifth, every = _least(folder, recorded, ["-O2"], [[], ["5"], ["1"]])
@@ -89,7 +89,10 @@ def robust_over_nominal(name: str, frame: str, recorded: list[Vector]) -> list[s
 
 
 def _least(folder: Path, recorded: list[Vector], flags: list[str], variants: list[list[str]]) -> list[Vector]:
-    """Return the shortest time of each tick and of its gradient, µs, shape (ticks, 2), for each list of arguments."""
+    """Return the shortest time of each tick and of its gradient, µs, shape (ticks, 2).
+
+    ``variants`` are lists of arguments for ``controller_times.c``.  Each of them gets its own array of times.
+    """
     with tempfile.TemporaryDirectory() as scratch:
         program, data = Path(scratch) / "times", Path(scratch) / "ticks.bin"
         np.array([recorded[0], *recorded]).tofile(data)
@@ -105,7 +108,7 @@ def _least(folder: Path, recorded: list[Vector], flags: list[str], variants: lis
 
 
 def equality(ticks: int) -> Iterator[str]:
-    """Yield the differences between both controllers in the same states."""
+    """Yield a table of the differences between both controllers in the same states."""
     some, most = controller_equality.SOME, controller_equality.MOST
     yield (
         f"{ticks} ticks of each kind of states. Controls are compared relative to the largest. *Its own*: largest "

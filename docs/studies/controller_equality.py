@@ -37,11 +37,11 @@ HEAD = (
     "robot|states|solved|largest difference of u|over 1e-9|its own|relaxed|status differs (Python/C)|"
     "C: violation, optimality|Python's|held (C)|difference of q_r"
 ).split("|")
-# Tolerances of a right answer: violation of hard constraints, and residual of optimality.
+# Tolerances of a correct solution: violation of hard constraints, and residual of optimality.
 HOLDS, OPTIMAL = 1e-9, 1e-7
 # Every SOME-th relaxed tick is certified.  Of the solved ticks whose controls differ, the first MOST are certified.
 SOME, MOST = 20, 500
-# Robots whose controllers run a million ticks.
+# Robots for the measurement of memory growth.
 GROWTH = ("tilthex_arm", "panda", "solo8", "talos")
 
 
@@ -52,9 +52,8 @@ class States:
     Attributes:
         push: Standard deviation of random joint accelerations by pushes, rad/s² or m/s²; pushes act half of the time.
         size: Size of random, unrelated states; 0 selects the states of a moving robot.
-        follows: ``term`` or ``flow`` if this part of the controller follows the gradient of an impact, through all
-            phases.
-        again: Number of ticks after which the robot returns to its start, because the robot may have fallen.
+        follows: ``term`` or ``flow`` if the impact-robust term or the reference flow is active.
+        again: Number of ticks after which the robot returns to its start, because it may have fallen.
     """
 
     push: float = 0.0
@@ -82,11 +81,10 @@ class Agreement:
         solved: Number of ticks that both controllers solved.
         worst: Largest relative difference between the controls in these ticks.
         differ: Number of solved ticks whose controls differ by more than 1e-9.
-        own: Largest relative change of the controls of Python in these ticks if the last digits of the program
-            change.
+        own: Largest relative change of the Python controls in these ticks if the last digits of the QP change.
         relaxed: Number of ticks that both controllers relaxed.
         other: Number of ticks with different statuses, by ``Python/C``.
-        held: Number of ticks in which the controller in C failed and repeated its command.
+        held: Number of ticks in which the controller in C failed and repeated its last command.
         off: Largest violation and residual of optimality in the certified ticks; rows: C, Python.
         wrong: Number of certified ticks in which the answer of C, or of Python, is wrong.
         reference: Largest difference between the postures that both flows have reached, rad or m.
@@ -115,7 +113,7 @@ class Agreement:
 
 
 def objective_of(name: str) -> WorstCaseObjective:
-    """Return the objective that the reference flow of a robot follows in the studies."""
+    """Return the objective that the reference flow of a robot minimizes in the studies."""
     return next(case for case in CASES if case.robot == name).problem().objective
 
 
@@ -162,7 +160,7 @@ def agreement(name: str, kind: str, ticks: int) -> Agreement:
 
 
 def _compare(tally: Agreement, ours: Controller, a: Command, b: Command) -> None:
-    """Count a tick.  Certify both answers if they differ, and in some relaxed ticks."""
+    """Add a tick to the agreement.  Certify both solutions if they differ, and in every SOME-th relaxed tick."""
     answered, certify = (Status.SOLVED, Status.RELAXED), a.status is not b.status
     tally.held += b.status not in answered
     if certify:
@@ -192,7 +190,7 @@ def _difference(u: Vector, other: Vector) -> float:
 
 
 def _moved(controller: Controller) -> Vector:
-    """Return the controls for the last program, after each number of the program is changed by its last digit."""
+    """Return the controls for the last QP if the last digit of each of its numbers changes."""
     qp, rng = controller.assembly.rank.qp, np.random.default_rng(0)
     digits = np.finfo(float).eps * rng.choice([-1.0, 1.0], size=(qp.n, qp.n))
     bounds = 1.0 + np.finfo(float).eps * rng.choice([-1.0, 1.0], size=qp.n + qp.m)

@@ -26,12 +26,12 @@ _PREFIX = Path(pin.__file__).parents[4]
 
 
 class Missing(Exception):
-    """This machine lacks a requirement of the peer."""
+    """This machine lacks a requirement of the C++ controller."""
 
 
 @contextmanager
 def peer() -> Iterator[Path]:
-    """Build the peer.  The build takes minutes, because it compiles the algorithms of Pinocchio.
+    """Build the C++ controller.  The build takes minutes, because it compiles the algorithms of Pinocchio.
 
     Raises:
         Missing: Headers or a compiler are missing, or the source distribution of DAQP is not in the cache.
@@ -52,7 +52,7 @@ def _build(folder: Path, daqp: Path) -> Path:
     sources = [str(path) for path in (daqp / "src").glob("*.c")]
     library = str(next((_PREFIX / "lib").glob("libboost_serialization.so*"), "-lboost_serialization"))
     headers = ["-I", str(daqp / "include"), "-isystem", str(_PREFIX / "include")]
-    # The wheel of CasADi has the headers of Eigen, the wheel of Pinocchio does not.
+    # Use the Eigen headers in the wheel of CasADi, because the wheel of Pinocchio contains none.
     eigen = ["-isystem", str(Path(casadi.__file__).parent / "include" / "eigen3")]
     definitions = [f"-D{word}" for word in DEFINITIONS]
     objects = [f"{Path(source).stem}.o" for source in sources]
@@ -72,10 +72,7 @@ def _build(folder: Path, daqp: Path) -> Path:
 
 
 def times(program: Path, name: str, recorded: list[Vector]) -> tuple[float, float]:
-    """Return median and 99th percentile of the times of ticks, µs.
-
-    The time of a tick is the shortest time of its repetitions.
-    """
+    """Return median and 99th percentile of the times of ticks, µs.  Each time is the shortest of all repetitions."""
     robot, formulation = formulation_of(name)
     controller = Controller(robot, formulation)
     controller.reset(robot.posture(), np.zeros(robot.nv))

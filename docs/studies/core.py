@@ -1,4 +1,4 @@
-"""Functions that studies share: list of studies, description of the machine, timing, start postures, tables."""
+"""Functions that studies share, and the list of all studies."""
 
 from __future__ import annotations
 
@@ -34,7 +34,10 @@ CRBA_CALLS = 2000
 
 @dataclass(frozen=True)
 class Study:
-    """Study with a generator: ``lines(request)`` of a module in this folder, or another given by ``module:name``."""
+    """Study with a name, a description, and the generator of its results.
+
+    ``source`` is a module in this folder with the generator ``lines(request)``, or ``module:name`` of the generator.
+    """
 
     name: str
     source: str
@@ -44,7 +47,7 @@ class Study:
     target: str = ""  # target of make that writes the page
 
     def lines(self, request: Request) -> Iterator[str]:
-        """Yield the lines of the page or output of the study."""
+        """Run the study and yield its results as lines of text."""
         module, _, function = self.source.partition(":")
         return getattr(import_module(f"docs.studies.{module}"), function or "lines")(request)
 
@@ -90,7 +93,7 @@ STUDIES = {
 
 @dataclass(frozen=True)
 class Request:
-    """Options of the command line for a study; ``missed`` collects the goals that the study misses."""
+    """Options from the command line.  A study adds the goals that it misses to ``missed``."""
 
     only: str = ""
     count: int = 1
@@ -103,7 +106,7 @@ class Request:
 
 
 def page_of(name: str) -> Path:
-    """Return the page of a study in the documentation."""
+    """Return the path of the page of a study."""
     return ROOT / "docs" / "generated" / f"{name}.md"
 
 
@@ -147,7 +150,7 @@ def machine(*packages: str) -> str:
 
 @contextmanager
 def one_core() -> Iterator[None]:
-    """Keep this process on one core, if the system supports this."""
+    """Keep this process on one core if the system can."""
     allowed = os.sched_getaffinity(0) if hasattr(os, "sched_setaffinity") else set()
     if allowed:
         os.sched_setaffinity(0, {max(allowed)})
@@ -159,7 +162,7 @@ def one_core() -> Iterator[None]:
 
 
 def median_time(call: Callable[[], object], repeats: int) -> float:
-    """Return the median processor time of a call, s.  Processor time excludes other programs."""
+    """Return the median processor time of a call, s.  Unlike wall time, it excludes the time of other programs."""
     times = []
     for _ in range(repeats):
         began = time.thread_time()
@@ -169,7 +172,7 @@ def median_time(call: Callable[[], object], repeats: int) -> float:
 
 
 def crba_time(model: pin.Model) -> float:
-    """Return the median processor time of a call of Pinocchio ``crba``, s, as a unit of the speed of this machine."""
+    """Return the median processor time of Pinocchio ``crba``, s, as a measure of the speed of this machine."""
     data, q = model.createData(), pin.randomConfiguration(model, -np.ones(model.nq), np.ones(model.nq))
     return median_time(lambda: pin.crba(model, data, q), CRBA_CALLS)
 

@@ -1,4 +1,4 @@
-"""Effect of the compliance of feet, and accuracy of double precision against arithmetic with sixty digits."""
+"""Effect of the compliance of feet, and accuracy of double precision compared with 60-digit arithmetic."""
 
 from __future__ import annotations
 

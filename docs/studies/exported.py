@@ -38,7 +38,7 @@ def _standing(name: str, target: str) -> Iterator[list[str]]:
 
 
 def loader(request: Request) -> Iterator[str]:
-    """Yield a row for each robot: time of a call through the loader, of the same call from C, and the difference."""
+    """Yield a row for each robot: time of a call from Python, time of the same call from C, and the difference."""
     yield from (machine(), "")
     rows = (_loaded(name, request.count) for name in _LOADED if request.only in name)
     yield from table(["robot", "call from Python, µs", "from C", "above"], rows)

@@ -1,4 +1,4 @@
-"""Effect of constraints on the optimum: no constraints, no collisions, and motors that can hold the posture."""
+"""Effect of constraints on the optimum: without constraints, without collisions, and with holdable postures."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ STARTS = 16
 
 
 class Cost(NamedTuple):
-    """Searches under constraints, one for each seed.
+    """Results of searches under constraints, with several seeds.
 
     Attributes:
-        solutions: Best solution of each seed.
+        solutions: Solution of the search with each seed.
         start: Median time of a start, divided by the median in an unconstrained search just before; median over the
             seeds.
         search: Time of the whole search, divided by the time of the unconstrained search; median over the seeds.
@@ -114,10 +114,10 @@ def _row(robot: str, name: str, request: Request, ends: list[int], left: list[in
 
 
 def _cost(asked: dict[str, object], demands: dict[str, object], seeds: Sequence[int]) -> Cost | str:
-    """Search under constraints with several seeds; return the reason if a search fails."""
+    """Search under constraints with several seeds; return an error text if a search fails."""
     solutions, starts, searches, times = list[PostureSolution](), list[float](), list[float](), list[float]()
     for seed in seeds:
-        # Other work changes the speed of the machine, so an unconstrained search is timed for each ratio.
+        # Time an unconstrained search for each ratio, because other work changes the speed of the machine.
         apart = solved(asked | {"seed": seed})[1]
         solution, took = solved(asked | demands | {"seed": seed})
         if not isinstance(solution, PostureSolution):
@@ -130,7 +130,7 @@ def _cost(asked: dict[str, object], demands: dict[str, object], seeds: Sequence[
 
 
 def solved(asked: dict[str, object], finish_all: bool = True) -> tuple[PostureSolution | str, tuple[float, float]]:
-    """Return the solution or the reason of a failure, the median time of a start and the time of the search, s."""
+    """Return the solution or an error text, the median time of a start, and the time of the search, s."""
     try:
         problem = prepare(make_settings(asked)).problem
         began = time.perf_counter()

@@ -1,4 +1,4 @@
-"""Postures at which the reference flow of ``robust-flow`` rests, from random feasible starts; kinematics only."""
+"""Compare the postures at which the reference flow comes to rest with local optima.  No dynamics is simulated."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from impact_posture.robot.robot import Robot
 from impact_posture.system.processes import fork_map
 from impact_posture.tsid.flow.flow_direction import FlowOptions
 
-# Time within which a flow should come to rest, time at which a flow is stopped, and time of a finer flow, s.
+# Times, s: goal for coming to rest, end of a flow that does not rest, and duration of a flow with smaller steps.
 REST, LONGEST, FINE = 8.0, 16.0, 5.0
 FINER = FlowOptions(rho=0.0, mu=0.005, epsilon=1e-7)
-# Tolerance relative to H at the start: for the difference from an optimum, and for the difference between basins.
+# Values of H count as equal if their difference, divided by H at the start, is below this number.
 CLOSE = 0.01
 CASES = (
     Case("tilthex_arm", "tilthex_arm", DOWN),
@@ -61,14 +61,14 @@ def problem_of(case: Case) -> ConstrainedProblem:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Course of the flow, and the optimum of its basin.
+    """Course of the flow from one start, and the local optimum near its end.
 
     Attributes:
-        course: Course of the flow from the start.
-        optimum: ``H`` at the optimum of the basin, under the same constraints.
-        q: Posture of this optimum.
-        program: Whether the offline program, started at the end of the flow, gave this optimum; else a finer flow
-            did.
+        course: Course of the flow.
+        optimum: ``H`` at the local optimum, under the same constraints.
+        q: Posture at the local optimum.
+        program: True if the offline program, started at the end of the flow, computed this optimum; false if a flow
+            with smaller steps computed it.
     """
 
     course: Course

@@ -1,4 +1,4 @@
-"""Run the reference flow in C: an exported controller with a small driver, without ticks of the controller."""
+"""Run the reference flow of an exported controller in C, without the other parts of a tick."""
 
 from __future__ import annotations
 
@@ -48,8 +48,7 @@ class Course:
         rested: Time at which the flow came to rest, s; infinite if it did not.
         missed: Largest error of the contacts and tasks, m or rad.
         share: Largest static actuator load during the flow, divided by the allowed load.
-        room: Smallest distance of a joint from its limit, minus the margin, rad or m; negative if the margin is
-            violated.
+        room: Smallest distance of a joint from its limit, minus the required margin, rad or m.
         failures: Number of steps in which the solver failed.
     """
 

@@ -1,4 +1,6 @@
-"""Compare the lifted form (the impact equations are constraints) with the reduced form (the objective solves them).
+"""Compare two forms of the nonlinear program.
+
+In the lifted form, the impact equations are constraints.  In the reduced form, the objective function solves them.
 
 IPOPT solves both forms with exact Hessians from the same starts, without compiled code.
 """

@@ -1,4 +1,4 @@
-"""Maps and bounds of the global search for small redundancy, and basin hopping compared with multi-start."""
+"""Evaluate the global search: bounds for small redundancy, and basin hopping compared with multi-start."""
 
 from __future__ import annotations
 
@@ -43,13 +43,13 @@ _HOP = (
 
 
 def maps(request: Request) -> Iterator[str]:
-    """Yield the page of maps.  Its table has a row for each case."""
+    """Yield the page about bounds of the objective.  Its table has a row for each case."""
     yield from _machine(request)
     yield from table(_MAP.split("|"), _maps(request))
 
 
 def hops(request: Request) -> Iterator[str]:
-    """Yield the page of searches with equal time.  Its table has a row for each case."""
+    """Yield the page that compares searches with equal time.  Its table has a row for each case."""
     yield from _machine(request)
     yield from table(_HOP.split("|"), _searches(request))
 

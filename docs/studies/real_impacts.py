@@ -1,8 +1,7 @@
-"""Impacts of standing, fixed and flying robots: prediction of the rigid model and run of each controller.
+"""Compare predictions of the rigid model with simulated impacts of standing, fixed and flying robots.
 
-The prediction does not use the run.  The controller braces a robot that moves exactly as planned, and moves the end
-effector to the surface.  The inputs of the rigid model are the reached posture and the speed of the scenario.
-Finished runs are stored in build/real-impacts.
+The prediction does not use the simulated impact.  Its inputs are the speed of the scenario, and the posture that the
+controller reaches if the robot moves exactly as planned.  Finished runs are stored in build/real-impacts.
 """
 
 from __future__ import annotations
@@ -65,7 +64,7 @@ def scenario_of(name: str) -> Scenario:
 
 
 def predicted(factory: ControllerFactory, name: str) -> dict[str, float | None]:
-    """Predict H, the sticking jump and the Coulomb jump in the posture that a controller has at the impact."""
+    """Predict H, the sticking jump and the Coulomb jump in the posture that a controller plans for the impact."""
     setup = factory.setup
     task, oracle = setup.scenario.task, factory.objective().oracle
     q = resting_posture(factory.driver(name), task.settle, ahead=setup.gap if setup.scenario.contacts else 0.0)

@@ -1,4 +1,4 @@
-"""Experiments of the paper: the controllers of the paper with many seeds, and all controllers with a few seeds.
+"""Repeat the experiments of Afifi et al. 2026: their controllers with many seeds, other controllers with few seeds.
 
 Finished runs are stored in build/reproduction, so that an interrupted study can continue.
 """

@@ -1,4 +1,4 @@
-"""Scan postures of two robots: elbow angles of an arm over a floor, and the line from start to optimum of a humanoid.
+"""Simulate impacts in a series of postures: an arm with several elbow angles, and a humanoid from start to optimum.
 
 The nominal controller keeps the robot in each posture during the impact.  Only the posture changes.
 """
@@ -43,7 +43,7 @@ class Place:
     """Results at one posture of a scan.
 
     Attributes:
-        at: Position along the scan: the elbow angle, rad, or the share of the line.
+        at: Elbow angle, rad, or for the humanoid the position between start (0) and optimum (1).
         H: Predicted squared velocity jump per squared impulse.
         V: Predicted squared velocity jump per squared approach speed, without friction.
         S: Predicted squared velocity jump per squared approach speed if the contact sticks, or ``None``.
@@ -75,7 +75,7 @@ def lines(request: Request) -> Iterator[str]:
 
 
 def _caption(scans: Mapping[str, Sequence[Place]]) -> Iterator[str]:
-    """Describe the picture in words."""
+    """Return the caption of the picture."""
     if ARM in scans:
         fine = [p for p in scans[ARM] if p.status == "completed"]
         start = min(fine, key=lambda p: abs(p.at - _SHIPPED))
@@ -115,7 +115,7 @@ def _scan(name: str, request: Request) -> list[Place]:
 
 
 def _places(name: str, count: int) -> Vector:
-    """Return the elbow angles of the arm, or the shares of the humanoid's line from start to optimum."""
+    """Return the values of :attr:`Place.at` for the arm or the humanoid."""
     if name == HUMANOID:
         return np.linspace(0.0, 1.0, count)
     return np.unique(np.append(np.linspace(0.0, _LARGEST, count), _SHIPPED).round(6))

@@ -1,4 +1,4 @@
-"""Computation time with feet, cones and other options: build and solve from one start, and exported gradient."""
+"""Time to build and solve problems with feet, cones and other options, and time of the exported gradient."""
 
 from __future__ import annotations
 

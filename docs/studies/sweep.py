@@ -1,9 +1,9 @@
 """Robustness and computation time of sweeps.  Run with ``make study-sweep``.
 
-Four runs must write the same bytes as a process pool: a Dask cluster that loses a worker, MPI ranks, Slurm jobs on
-this machine, and a parent that is killed at random times.  The study then measures the speed, the memory of a long
-run, and the overhead of a task.  ``python -m docs.studies.sweep FOLDER ROBOT POINTS`` starts or continues a large
-sweep.
+Four runs must write the same bytes as a process pool: on a Dask cluster that loses a worker, on MPI ranks, with local
+Slurm jobs, and with a main process that is killed at random times.  The study then measures the speed, the memory of
+a long run, and the overhead of a task.  ``python -m docs.studies.sweep FOLDER ROBOT POINTS`` starts or continues a
+large sweep.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def killed_dask_worker(sweep: Sweep, folder: Path) -> None:
 
 
 def mpi_ranks(file: Path, folder: Path) -> None:
-    """Run the sweep on three MPI ranks, the first of which is the parent."""
+    """Run the sweep on three MPI ranks.  The first rank is the main process."""
     mpiexec = shutil.which("mpiexec", path=f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
     if mpiexec is None:
         raise FileNotFoundError("no mpiexec")
@@ -169,7 +169,7 @@ def robustness(folder: Path, only: str = "") -> None:
 
 
 def speed(folder: Path, points: int) -> None:
-    """Measure the share of the solver in the time, the memory of this process, and the gain of a second process."""
+    """Measure the share of time in the solver, the memory of this process, and the speedup by a second process."""
     file = folder / "long.toml"
     file.write_text(SMALL.replace("count = 10", f"count = {max(2, round((points / 6) ** 0.5))}").replace("20", "256"))
     sweep, seen = read_sweep(file), list[tuple[int, float]]()
@@ -216,7 +216,6 @@ class Watched(Executor):
         self._pool, self.finished = pool, list[tuple[float, float]]()
 
     def submit(self, *task: Any, **options: Any) -> Future[Any]:
-        """See ``Executor``."""
         future = self._pool.submit(*task, **options)
         future.add_done_callback(lambda f: self.finished.append((f.result().solver_s, f.result().total_s)))
         return future

@@ -106,7 +106,7 @@ class Flight:
 
     @property
     def usual(self) -> Vector:
-        """Median of the times, and mean of the shortest 99 %, which leaves out interruptions by other programs."""
+        """Return the median of the times, and the mean of the shortest 99 %, which excludes most interruptions."""
         took = np.sort(self.took)
         return np.array([np.median(took), took[: int(0.99 * took.size)].mean()])
 

@@ -24,7 +24,7 @@ def arm(
     rods: Sequence[ArrayLike] | None = None,
     effort: float = 5.0,
 ) -> Robot:
-    """Build a serial arm of hinges with frames ``link_0``, ``link_1``, …, and ``tip`` on the last link.
+    """Build a serial arm with hinge joints and the frames ``link_0``, ``link_1``, …, and ``tip`` on the last link.
 
     Args:
         axes: Axis of each hinge in the frame of the preceding body.
@@ -61,7 +61,7 @@ def arm(
 
 
 def yaw_and_pitches() -> Robot:
-    """Build a hexarotor with an arm (yaw, pitch, pitch, pitch), so that only the base can roll the tip."""
+    """Build a hexarotor with an arm (yaw, pitch, pitch, pitch).  Only a motion of the base can roll the tip."""
     return arm([Z, Y, Y, Y], [0.3, -0.8, 1.2, -0.5], floating=True)
 
 

@@ -26,7 +26,7 @@ import rich.table
 import typer.rich_utils
 from matplotlib.figure import Figure
 
-# The commands import these modules when they run.  Importing all modules once, before the forks, saves time.
+# Commands import these modules when they run.  Import them once before the forks, because this saves time.
 import impact_posture.codegen.export
 import impact_posture.experiment.experiment_folders
 import impact_posture.experiment.jobs
@@ -48,7 +48,7 @@ from impact_posture_cli.app import COMMANDS, app, load
 with contextlib.suppress(ImportError):
     import mujoco  # noqa: F401
 
-# These libraries read or build their data only once per process.
+# These libraries load data at their first use.  Load the data before the forks.
 PIL.Image.preinit()
 rich.cells.cell_len("×")
 PARSER = typer.main.get_command(app)
@@ -70,10 +70,10 @@ def run(
     timeout: float = 600,
     pictures: Collection[str] = (),
 ) -> subprocess.CompletedProcess[str]:
-    """Run ``impact-posture`` with arguments, as its entry point does; ``env`` extends the environment variables.
+    """Run ``impact-posture`` with arguments, as its entry point does; ``env`` contains more environment variables.
 
-    Only the figures named in ``pictures`` are drawn; all others are blank.  Drawing takes most of the time for a
-    small robot.  The timeout only ends commands that hang.  No test fails because a command is slow.
+    Only the figures named in ``pictures`` are drawn, because drawing takes most of the time for a small robot.  Other
+    figures are blank.  The timeout is long: it only ends commands that hang.
     """
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as errors:
         child = start(arguments, out.fileno(), errors.fileno(), cwd, env, prepare, pictures)
@@ -148,7 +148,7 @@ def _command(
     pictures: Collection[str],
 ) -> None:
     """Run the command with the streams, folder, signal handlers and warnings that a new program would have."""
-    # Without `gc.freeze`, the garbage collector would write to memory shared with the test, which copies the memory.
+    # Without this call, the garbage collector would write to memory that is shared with the test, and copy it.
     gc.freeze()
     # A new program starts without cached controllers.
     impact_posture.experiment.jobs.controller_factory.cache_clear()

@@ -18,7 +18,10 @@ from tests.support.helpers import Vector, assert_close, central_gradient, rng
 def check_expression(
     constraint: ExpressionConstraint, model: pin.Model, postures: Iterable[Vector], turns: slice = slice(0)
 ) -> None:
-    """Check value and Jacobian of ``c(q)``; the rows in ``turns`` may all change sign, as quaternions may."""
+    """Check value and Jacobian of ``c(q)``.
+
+    The rows ``turns`` belong to a quaternion, so the check also accepts them with the opposite sign.
+    """
     chart, numeric = Chart(model), Numeric(model)
     x, p = ca.SX.sym("x", chart.nx), ca.SX.sym("p", constraint.parameters.size)
     symbolic = ca.Function("c", [x, p], [constraint.symbolic(Tree(model, chart.configuration(x), x), p)])

@@ -17,7 +17,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "generated" / "coverage.md"
 LEAST = 90.0
-# Why the coverage of these files may be below `LEAST`.
+# Files whose coverage may be below `LEAST`, with the reason.
 REASONS = {
     "cli/commands/reproduce.py": "the page for people: tests ask for JSON",
     "impact_posture/posture/program/posture_nlp.py": "what Ctrl-C does while IPOPT runs in the main process",

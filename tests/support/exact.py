@@ -1,7 +1,7 @@
 """Contact-consistent quantities, computed with sixty digits.
 
-The system ``[M, −J_sᵀ; J_s, εI]`` with Pinocchio's doubles for ``M, J, J_s`` is solved in decimal arithmetic, so that
-both this solution and the oracle use exactly the same numbers.
+The linear system with the matrix ``[M, −J_sᵀ; J_s, εI]`` is solved in decimal arithmetic.  ``M``, ``J`` and ``J_s``
+are doubles from Pinocchio, exactly as in the oracle.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class ExactImpact:
     """Exact quantities and gradients at one posture, for W = I and a normal in the world frame.
 
     Attributes:
-        oracle: Oracle at the posture, which gives ``M, J, J_s, n`` and their derivatives as doubles.
+        oracle: :class:`ImpactOracle` at the posture.  It gives ``M, J, J_s, n`` and their derivatives as doubles.
         compliance: Compliance ε of the supports, 1/kg; may differ from the oracle's compliance.
     """
 
@@ -104,8 +104,6 @@ class ExactImpact:
         """Return the solutions ``a`` and ``f`` for the right-hand side ``τ``."""
         solution = self.inverse[:, : self.nv] @ tau
         return solution[: self.nv], solution[self.nv :]
-
-    # ---- quantities -------------------------------------------------------------------------------------------
 
     @cached_property
     def n(self) -> Exact:
@@ -162,8 +160,6 @@ class ExactImpact:
         jump = self.sticking[1]
         return Decimal(jump @ jump)
 
-    # ---- gradients --------------------------------------------------------------------------------------------
-
     @cached_property
     def dM(self) -> Vector:
         """Derivative ``∂M_ij/∂q_k``, shape (nv, nv, nv)."""
@@ -204,8 +200,6 @@ class ExactImpact:
         r, b, g = self._held(np.concatenate([a, exact(np.zeros(len(self.K_held) - self.nv))]))
         feet = bracket(self.dJs, f, b) + bracket(self.dJs, g, a)
         return 2 * (bracket(self.dJ, s, b) + bracket(self.dJ, r, a) + feet - bracket(self.dM, b, a))
-
-    # ---- derivatives of the results ---------------------------------------------------------------------------
 
     def _moved(self, a: Exact, f: Exact, force: Exact) -> Exact:
         """Return ``∂_k a`` for ``M a − J_sᵀf = τ, J_s a + εf = 0``; ``force`` is ``∂_k τ``, shape (nv, nv)."""

@@ -40,7 +40,7 @@ def eliminated(matrix: Exact) -> Vector:
 
 
 class RoundedOnce(ExactImpact):
-    """Exact impact of a system matrix with random errors of one rounding of ``|L||U|`` (fixed contact point)."""
+    """Exact impact after random changes of the system matrix by one rounding of ``|L||U|`` (fixed contact point)."""
 
     def __init__(self, oracle: ImpactOracle, compliance: float, seed: int) -> None:
         super().__init__(oracle, compliance)
@@ -58,8 +58,6 @@ class Bounded(ExactImpact):
         root = np.linalg.cholesky(self.oracle.M)
         held = np.linalg.svd(np.linalg.solve(root, self.oracle.Js.T), compute_uv=False) ** 2
         return float(self.compliance / (held[held > 1e-12 * held[0]][-1] + self.compliance))
-
-    # ---- errors of elimination on K ---------------------------------------------------------------------------
 
     @cached_property
     def _backward(self) -> Vector:
@@ -106,14 +104,12 @@ class Bounded(ExactImpact):
 
     @cached_property
     def sticking_by_elimination(self) -> tuple[float, float]:
-        """Largest errors of S and ∇S: 3n roundings, each as bad as the worst of five random roundings."""
+        """Estimated largest errors of S and ∇S: 3n times the largest error after five random roundings."""
         others = [RoundedOnce(self.oracle, self.compliance, seed) for seed in range(5)]
         roundings = 3 * len(self.K_held)
         moved_S = max(abs(float(o.S - self.S)) for o in others)
         moved_gradient = max(float(rounded(abs(o.grad_S - self.grad_S)).max()) for o in others)
         return roundings * moved_S, roundings * moved_gradient
-
-    # ---- errors of a factorization of M̃ -----------------------------------------------------------------------
 
     @cached_property
     def _scale(self) -> Vector:

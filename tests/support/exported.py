@@ -26,7 +26,7 @@ class Exported:
     gradient: ImpactGradient
 
     def free(self) -> Exported:
-        """Return the functions of the same frame without its supports."""
+        """Return the exported functions that ignore the supports."""
         gradient = self.gradient
         return Exported(ImpactGradient(gradient._library, gradient.manifest, gradient.frame, free=True))
 

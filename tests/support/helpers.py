@@ -1,7 +1,4 @@
-"""Helpers of the mathematical tests: robots, random configurations, errors, finite differences, Pinocchio calls.
-
-The helpers do not call the code under test except to load a robot.
-"""
+"""Helpers of the mathematical tests.  They call the code under test only to load a robot."""
 
 from __future__ import annotations
 
@@ -50,7 +47,7 @@ def unit(generator: np.random.Generator, size: int = 3) -> Vector:
 def relative(actual: ArrayLike, expected: ArrayLike, scale: float = 0.0) -> float:
     """Return the largest deviation, divided by the largest expected entry or by ``scale``, whichever is larger.
 
-    For values that may be zero, pass a scale; for a gradient, the scale is the function value.
+    Pass a scale for values that may be zero.
     """
     x, y = np.array(actual, dtype=float), np.array(expected, dtype=float)
     assert x.size == y.size, (x.shape, y.shape)

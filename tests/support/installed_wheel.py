@@ -27,7 +27,7 @@ PACKAGES = {"impact_posture": "impact_posture", "cli": "impact_posture_cli", "ro
 # Files that only a checkout contains.
 UNSHIPPED = (".ci/", ".gitignore")
 
-# Every command of the app with fast options.  The commands of one row run one after the other.
+# Every command of the app with fast options.  Commands in the same row run one after the other.
 COMMANDS = [
     ["simulate solo8-push --format png --out run"],
     ["compare solo8-push --controllers nominal --seeds 1 --jobs 1 --format png --out comparison"],

@@ -1,4 +1,4 @@
-"""Solvers of the qpsolvers package, compared with DAQP on the programs of the online controllers."""
+"""Use a solver of the qpsolvers package instead of DAQP for the QPs of the online controllers."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from impact_posture.tsid.qp.quadratic_program import EQUALITY, QP, Solved
 
 
 class QpsolversSolver:
-    """Solver named in qpsolvers (``proxqp``, ``quadprog``, …), which starts every program without a warm start."""
+    """Solver of qpsolvers (``proxqp``, ``quadprog``, …).  It solves every QP without a warm start."""
 
     def __init__(self, name: str, **settings: float) -> None:
         self._name, self._settings = name, settings

@@ -96,8 +96,6 @@ class Relaxation:
         return Answer(code, z, report.iterations, report.violation, shortest)
 
 
-# ---- certificate --------------------------------------------------------------------------------------------------
-
 # Smallest violation that is significant, relative to the length of a row times the size of the point.
 COUNTS = 1e-7
 

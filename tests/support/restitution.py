@@ -17,7 +17,7 @@ from impact_posture.simulation.world.scene import Physics, Scene, Shape, Surface
 from impact_posture.simulation.world.world import World, build_world
 
 _RADIUS = 0.02
-# The test assumes that a contact never ends if it lasts longer than this number of time constants of the law.
+# A contact that lasts longer than this number of time constants counts as a contact that never ends.
 _PATIENCE = 200
 # Fractions of a time step at which the first touch occurs; restitution depends slightly on this fraction.
 _PHASES = (0.1, 0.3, 0.5, 0.7, 0.9)
@@ -25,7 +25,7 @@ _PHASES = (0.1, 0.3, 0.5, 0.7, 0.9)
 
 @dataclass(frozen=True)
 class Bounce:
-    """Measured impact, averaged over the moments of a time step at which the touch may occur.
+    """Measured impact, averaged over several fractions of a time step at which the first touch occurs.
 
     Attributes:
         restitution: Normal speed after the impact, divided by the normal speed before.

@@ -1,4 +1,4 @@
-"""Largest change of the desired posture acceleration within a time step that ramps and fades can cause."""
+"""Bounds on how much ramps and fades change the desired posture acceleration within a time step."""
 
 from __future__ import annotations
 

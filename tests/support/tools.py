@@ -1,4 +1,4 @@
-"""Tools that a machine may lack.  A test that needs a missing tool is skipped and names the tool."""
+"""Tools that a machine may lack, such as compilers.  A test that needs a missing tool is skipped."""
 
 from __future__ import annotations
 

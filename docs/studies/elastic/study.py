@@ -26,8 +26,8 @@ from tests.support.arms import TIP, seven_joints
 from tests.support.helpers import rng, unit
 
 SPEED = 0.5  # approach speed, m/s
-# Number of contact stiffnesses for each posture.  They span x = 0.05 to 2, with x for the compression time of the
-# links alone.
+# Number of contact stiffnesses for each posture.  Their values of x, computed with the compression time of the links
+# alone, are between 0.05 and 2.
 STIFFNESSES = 10
 LEAST, LARGEST = 0.05, 2.0
 # Normals are left out if the joints move the contact point along the normal by less than this, m/rad.
@@ -87,7 +87,7 @@ STUDIED = {
 
 @dataclass(frozen=True)
 class Row:
-    """One impact: errors of the prediction of each model against the measurement."""
+    """Errors of the predictions of all models for one impact."""
 
     robot: str
     x: float  # x for the compression time of the elastic response
@@ -99,7 +99,7 @@ class Row:
 
 
 def rows_of(name: str, count: int, seed: int) -> Iterator[Row]:
-    """Yield impacts of a robot with random postures within the limits, random normals, and stiffnesses for all x."""
+    """Yield impacts of a robot in random postures with random normals and all contact stiffnesses."""
     studied = STUDIED[name]
     arm, generator = studied.robot(), rng(name, seed)
     low, high = (np.array(limit) for limit in (arm.model.lowerPositionLimit, arm.model.upperPositionLimit))
@@ -173,7 +173,7 @@ def lines(request: Request) -> Iterator[str]:
 
 
 def _verdicts(rows: Sequence[Row], request: Request) -> Iterator[str]:
-    """Yield whether goals are met, and the range in which the rules of thumb are valid, with x for both times."""
+    """Yield whether goals are met, and the range of x in which each rule of thumb is valid."""
     for model, values, goal, where in (
         ("elastic", "error", 0.10, "peak link velocity"), ("elastic", "force_error", 0.15, "peak force"),
     ):  # fmt: skip

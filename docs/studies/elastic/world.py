@@ -1,7 +1,4 @@
-"""MuJoCo model of an arm with elastic joints.
-
-Springs connect the bodies of links and rotors; a spring is the contact.
-"""
+"""MuJoCo model of an arm with elastic joints.  Springs connect links and rotors, and the contact is a spring."""
 
 from __future__ import annotations
 
@@ -13,8 +10,8 @@ from docs.studies.core import Vector
 from impact_posture.dynamics.mjcf import build_mjcf, import_mujoco, pose
 from impact_posture.impact.elasticity.elastic_impact import ElasticImpact
 
-# Mass (kg) and moments of inertia (kg m²) of the body of a rotor.  The inertia of the rotor is the armature of its
-# joint.
+# Mass (kg) and moments of inertia (kg m²) of the body of a rotor.  They are negligible, because the armature of the
+# rotor joint contains the inertia of the rotor.
 _TINY = 1e-9
 # Number of simulation steps from touch to greatest compression.
 STEPS = 4000

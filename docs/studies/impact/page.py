@@ -80,7 +80,7 @@ def _rank_row(row: Row) -> list[str]:
 
 
 def _left_out(rows: Sequence[Row]) -> list[str]:
-    """Return a line for each robot and surface for which a posture was left out, with the reasons."""
+    """Return a line for each robot and surface for which postures were left out, with the reasons."""
     entries = [
         f"- {row.robot}, {_friction(row.surface)}: {count} left out, {reason}"
         for row in rows
@@ -90,7 +90,7 @@ def _left_out(rows: Sequence[Row]) -> list[str]:
 
 
 def _verdicts(rows: Sequence[Row]) -> Iterator[str]:
-    """Yield whether the targets are met for ``√C``, for ``√V`` without friction and for ``√S`` with friction."""
+    """Yield whether ``√C``, ``√V`` (no friction) and ``√S`` (with friction) predict the jumps as well as intended."""
     frictions = dict.fromkeys(row.surface.friction for row in rows)
     wanted = [("coulomb", mu, 0.95) for mu in frictions]
     for objective, mu, least in [
@@ -113,7 +113,7 @@ def _verdicts(rows: Sequence[Row]) -> Iterator[str]:
 
 
 def _which_stick(dropped: Sequence[Dropped], rows: Sequence[Row]) -> Iterator[str]:
-    """Yield which postures stick, by the angle of the sticking impulse, for Coulomb friction and MuJoCo friction."""
+    """Compare predicted and simulated sticking, with Coulomb friction and with the friction of MuJoCo."""
     between = [row for row in rows if 0 < row.surface.friction < np.inf]
     yield from ("### Which postures stick", "")
     yield "A posture *should stick* if its sticking impulse needs at most the friction of the surface: the tangential"
@@ -149,10 +149,7 @@ def _convex_row(row: Row) -> list[str]:
 
 
 def _variations(dropped: Sequence[Dropped], postures: int) -> Iterator[str]:
-    """Vary speed, restitution and stiffness, for a frictionless and a sticking contact.
-
-    The lightest robot has separate rows.
-    """
+    """Yield a table of impacts with other speeds, restitutions and stiffnesses.  The lightest robot has own rows."""
     few = [replace(robot, scenes=robot.scenes[:_FEW]) for robot in dropped]
     body, gone = [], []
     parts = ("", [r for r in few if r.robot != LIGHTEST]), (f", {LIGHTEST}", [r for r in few if r.robot == LIGHTEST])

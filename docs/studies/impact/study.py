@@ -49,7 +49,10 @@ VARIATIONS = (
 
 
 def needed_friction(predicted: ImpactQuantities) -> float:
-    """Return the smallest friction for which the contact point sticks: tangential over normal part of its impulse."""
+    """Return the smallest friction coefficient for which the contact point sticks.
+
+    It is the tangential part of the impulse of a sticking contact, divided by the normal part.
+    """
     s, n = predicted.sticking_impulse, predicted.normal
     return float("nan") if s is None else float(np.linalg.norm(s - (n @ s) * n) / (n @ s))
 
@@ -97,7 +100,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Row:
-    """One robot on one surface: outcomes of the postures, and the number of postures left out, by reason."""
+    """Outcomes of all postures of one robot on one surface, and the number of omitted postures by reason."""
 
     robot: str
     surface: Surface
@@ -134,7 +137,7 @@ class Row:
 
 @dataclass(frozen=True, eq=False)
 class Dropped:
-    """Random postures of one robot, prepared for impacts on surfaces."""
+    """Random postures of one robot, in which it hits surfaces."""
 
     robot: str
     scenes: tuple[tuple[Scene, ImpactQuantities], ...]

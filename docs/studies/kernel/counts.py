@@ -34,9 +34,9 @@ def of_function(function: ca.Function) -> Operations:
 def of_export(objective: WorstCaseObjective) -> tuple[Operations, int | None]:
     """Count the operations of one call of the exported ``eval``, without and with vector instructions.
 
-    A call runs only the blocks that its outputs need, so only the reachable part of the graph is counted.  The second
-    number counts an operation on all repeated limbs once, but each sine and cosine.  This number is ``None`` if there
-    are no repeated limbs.  The order of sums in the C code is ignored, which changes the count by at most 1 %.
+    A call runs only the blocks that its outputs need, so only the reachable part of the graph is counted.  In the
+    second number, a vector instruction for all repeated limbs counts once, but each sine and cosine counts.  This
+    number is ``None`` if there are no repeated limbs.  Ignoring the order of sums changes the count by at most 1 %.
     """
     exported = export_library([NamedObjective(objective, "kernel")])
     outputs = next(f.outputs for f in exported.functions if f.name == "eval")

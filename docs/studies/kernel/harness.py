@@ -1,4 +1,4 @@
-"""Compare kernels with Pinocchio at random configurations, then measure their times with C loops that take turns."""
+"""Check kernels (implementations of H and ∇H) against Pinocchio, then measure their times with C loops."""
 
 from __future__ import annotations
 
@@ -28,14 +28,13 @@ COUNT = 256
 # Number of configurations for finite differences.  Few configurations are enough, because each needs many calls of H.
 FEW = 16
 STEP = 1e-5
-# Number of first rounds that are not timed.  Before each timed pass, an untimed pass restores the caches, which other
-# kernels have changed.
+# Number of rounds at the beginning that are not timed.
 _UNCOUNTED = 2
 Kind = Literal["eval", "value", "batch", "differences"]
 
 
 class Absent(Exception):
-    """A peer cannot run on this machine; the message states the reason."""
+    """Another implementation cannot run on this machine; the message states the reason."""
 
 
 class Disagreement(Exception):
@@ -87,7 +86,7 @@ class Samples:
 
     @cached_property
     def reference(self) -> tuple[Vector, Vector]:
-        """H and ∇H by the dense linear algebra of the oracle, which shares no code with any of the kernels."""
+        """H and ∇H by dense linear algebra with Pinocchio, which shares no code with the kernels."""
         pairs = []
         for q, (x, y, z) in zip(*self.drawn, strict=True):
             oracle = ImpactOracle(ImpactCase(self.robot, ImpactContact(self.frame, (float(x), float(y), float(z)))))
@@ -101,7 +100,7 @@ class Samples:
 
     @property
     def plain(self) -> bool:
-        """Whether every joint has one number in ``q`` and in ``v``, except a free-flyer at the root."""
+        """Whether every joint, except a free-flyer at the root, has one entry in ``q`` and one in ``v``."""
         model, first = self.robot.model, 2 if self.robot.floating else 1
         return all(pair == (1, 1) for pair in zip([*model.nqs][first:], [*model.nvs][first:], strict=True))
 
@@ -137,7 +136,7 @@ class Harness:
     def pass_s(self, kind: Kind, function: ctypes.c_void_p) -> float:
         """Return the processor time of a pass divided by the number of configurations, s.
 
-        An untimed pass runs first.
+        An untimed pass runs first, because other kernels have changed the processor caches.
 
         Raises:
             Disagreement: A call returned an error code.

@@ -1,7 +1,4 @@
-"""Kernels of our export and of other implementations.
-
-Each group is a function that returns kernels for the samples.
-"""
+"""Kernels of our export and of other implementations.  Each public function returns kernels for one robot."""
 
 from __future__ import annotations
 
@@ -46,9 +43,6 @@ int kernel_eval(const double *q, const double *n, double *H, double *grad)
 """
 
 
-# ---- ours ---------------------------------------------------------------------------------------------------------
-
-
 def exported(objective: WorstCaseObjective, prefix: str) -> tuple[Iterator[tuple[str, Built]], float]:
     """Build the C export with each set of flags.  Return the builds by name, and the size of the source, kB."""
     with tempfile.TemporaryDirectory() as folder:
@@ -71,9 +65,6 @@ def ours(samples: Samples) -> list[Kernel]:
         kernels.append(Kernel(f"ours {label}", "ours", built, functions, count, packed, size))
         kernels.append(Kernel(f"differences {label}", "differences", built, {"differences": functions["value"]}))
     return sorted(kernels, key=lambda kernel: kernel.group != "ours")
-
-
-# ---- CasADi's own C -----------------------------------------------------------------------------------------------
 
 
 def same_graph(samples: Samples) -> list[Kernel]:

@@ -1,7 +1,7 @@
 // H = aᵀa with M a = Jᵀn, and its tangent gradient, in Pinocchio C++, as an experienced user would write them.
 //
-// Every formulation is ∇H = 2 ∂_q[nᵀJb − bᵀMa] with M b = a (the letters a, b held fixed); they differ in which
-// algorithms do the work:
+// Every formulation computes ∇H = 2 ∂_q[nᵀJb − bᵀMa] with M b = a, where a and b are constant in ∂_q.  The formulations
+// use different algorithms:
 //   rnea   crba + cholesky + computeRNEADerivatives (its dτ/dq, transposed, times b), stock algorithms only
 //   chol   crba + cholesky, the gradient by two velocity sweeps and one backward sweep over Pinocchio's spatial types
 //   aba    aba() for a, its factorization kept for b, the gradient as in chol
@@ -74,7 +74,7 @@ struct Peer
   Links<Matrix6> Ia;
   Links<Vector6> S, U;
   std::vector<double> reciprocal, torque;
-  // The solve gives the twist of a free-flyer.  Its six rates are this twist in the axes of the base.
+  // Factorized inertia of the base.  A solve gives the twist of the free-flyer in world axes.
   Eigen::LLT<Matrix6> base;
 
   Peer(const Model & m, Index contact, const Vector3 & position)
@@ -133,7 +133,7 @@ void velocity(const Peer & p, Index i, const Vector & rates, Links<Motion> & v)
   }
 }
 
-// The wrench of the contact is constant in world axes while the link turns.
+// n × ṗ, where the contact point p moves with the velocity vb of its link.
 Vector3 turning(const Peer & p, const Vector3 & n)
 {
   const Motion & v = p.vb[p.contact];
@@ -178,8 +178,6 @@ void gradient(Peer & p, const Vector3 & n, double * grad)
     project(p, i, t, [&](int k, double value) { grad[k] = value; });
   }
 }
-
-// ---- rnea: stock algorithms; chol: stock factorization, sweeps by hand ----------------------------------------
 
 double value_chol(Peer & p, const Vector3 & n)
 {
@@ -228,8 +226,6 @@ double eval_chol(Peer & p, const Vector3 & n, double * grad)
   gradient(p, n, grad);
   return H;
 }
-
-// ---- hand and aba: articulated bodies -------------------------------------------------------------------------
 
 // Articulated inertias in world axes; U = I^A S, 1/(Sᵀ U + armature).
 void factor_hand(Peer & p)

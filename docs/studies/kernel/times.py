@@ -1,8 +1,7 @@
 """Compare implementations of H and ∇H by time, operations, source size and compile time.
 
-All implementations use the same configurations and normals, W = I, and the robot without supports.  After a check of
-their numbers, C loops call the implementations in turns on one core.  Lines below the table name implementations that
-cannot run.
+All implementations use the same configurations and normals, W = I, and the robot without supports.  Their results are
+checked first.  Then C loops call the implementations alternately on one core.
 """
 
 from __future__ import annotations
@@ -21,8 +20,8 @@ from impact_posture.robot.robot_loader import load_robot
 
 ROBOTS = ("solo8", "tilthex_arm", "panda", "talos")
 PEERS = {"same graph": same_graph, "pinocchio": kernels, "adam": adam, "casadi": dense}
-# Our fastest row is compared with the fastest row whose name starts with the first text and differs from the second
-# text.
+# Text of a comparison → two texts.  Our fastest row is compared with the fastest row whose name starts with the first
+# text and is not the second text.
 _AGAINST = {
     "Pinocchio's own derivative algorithms": (DERIVATIVES, ""),
     "the fastest by hand on Pinocchio's types": ("Pinocchio", DERIVATIVES),
@@ -48,7 +47,7 @@ class Report:
         return min((_single(t) for (_, t, _), fits in zip(self.rows, names, strict=True) if fits), default=None)
 
     def compared(self, start: str, but: str) -> str:
-        """Return text: how many times faster our code is, and in brackets, how many times faster our batch is."""
+        """Return as text how many times faster our code is and, in brackets, our code for batches."""
         other, own = self.fastest(start, but), self.fastest("ours") or 1.0
         batch = min(times["batch"] for _, times, _ in self.rows if "batch" in times)
         return "–" if other is None else f"{other / own:.1f} ({other / batch:.1f})"

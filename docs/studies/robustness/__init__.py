@@ -1,1 +1,1 @@
-"""Study of random variations of the shipped experiments, which shows where each controller helps."""
+"""Study that varies the shipped experiments, to measure in which situations each controller helps."""

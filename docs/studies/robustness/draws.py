@@ -1,4 +1,4 @@
-"""Points of the envelope of a shipped scenario (variations and random draws), and their setups."""
+"""Points of the envelope of a scenario (variations of one value, and random draws), and their simulation setups."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def _generator(scenario: str, number: int, attempt: int, seed: int, what: int = 
 
 
 def draw(scenario: str, number: int, attempt: int = 0, seed: int = 0) -> Draw:
-    """Return a point of the envelope: a variation, or else a random draw.  Equal arguments give equal points."""
+    """Return a point of the envelope.  Numbers below the number of variations are variations, others random draws."""
     named = list(VARIATIONS[scenario].items())
     if number < len(named):
         name, values = named[number]
@@ -148,7 +148,7 @@ def _push(scenario: Scenario, task: SinglePush, v: Mapping[str, float]) -> Scena
 
 
 def _stiffer(gains: Gains, factor: float) -> Gains:
-    """Scale the gains.  Each task of the shipped pushes has one stiffness and critical damping."""
+    """Scale the stiffness of all tasks in a shipped push scenario, with critical damping."""
     if isinstance(gains.kp, tuple) or gains.kd is not None:
         raise InputError("a task with a damping of its own", where="robustness study", hint="scale it too")
     return replace(gains, kp=factor * gains.kp)

@@ -1,4 +1,4 @@
-"""Targets that each controller meets over the envelope of a scenario, for the page of the reproduction."""
+"""Page about the targets that each controller meets in variations of a scenario (the envelope)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from impact_posture.experiment.reproduction import PAPER
 from impact_posture.simulation.controllers.controller_factory import MEANING
 
 Records = Mapping[str, Sequence[Record]]
-# A controller is recommended only if it meets every target at least at this share of the points.
+# A controller is recommended only if it meets every target in at least this share of the variations.
 _OFTEN = 2 / 3
 # Number of variations that a sentence of the page lists.
 _TOLD = 7
@@ -68,7 +68,7 @@ def spread(values: Sequence[float]) -> str:
 
 
 def choice(name: str, own: Sequence[Record]) -> str:
-    """Recommend the controller that meets every target most often.  Of equal controllers, choose the least motion."""
+    """Return the controller that meets every target most often.  In case of a tie, choose the least motion."""
     summaries = [summarize(own, c) for c in COMPARED if c != NOMINAL]
     best = min(summaries, key=lambda s: (-s.kept, s.motion[1]))
     reliable = best.kept >= _OFTEN * best.count
@@ -87,7 +87,7 @@ def choice(name: str, own: Sequence[Record]) -> str:
 
 
 def _tuned(name: str, own: Sequence[Record]) -> str:
-    """Compare, for single variations, the term of the paper with the control law without a gain."""
+    """Compare the controllers ``robust`` (term with a gain) and ``robust-flow`` (no gain) in single variations."""
     parts = []
     for controller in ("robust", "robust-flow"):
         named = [(r.draw.name, change(r, controller)) for r in tried(own) if r.draw.name]

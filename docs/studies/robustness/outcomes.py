@@ -39,8 +39,7 @@ SATURATED = 0.05
 ATTEMPTS = 40
 # Entries of the document of a run that a record does not store.
 _LEFT_OUT = ("windows", "versions", "runs")
-# Largest number of offline postures in the cache of this process.  The number is enough for some points of each
-# scenario.
+# Maximum number of offline postures in the cache of this process.
 _KEPT = 16
 _OPTIMA: dict[str, OfflinePosture] = {}
 _Play = Callable[[Job, ControllerFactory], tuple[tuple[Run, ...], Document]]
@@ -48,7 +47,7 @@ _Play = Callable[[Job, ControllerFactory], tuple[tuple[Run, ...], Document]]
 
 @dataclass(frozen=True)
 class Record:
-    """One point of the envelope.
+    """Results of all controllers at one point of the envelope.
 
     Attributes:
         draw: Values of the point.
@@ -95,7 +94,7 @@ class Record:
 
 
 def key(scenario: str) -> str:
-    """Return the settings that must be equal in a stored record and in this code."""
+    """Return the settings of the study.  A stored record with other settings is outdated."""
     ranges = tuple((r.name, r.low, r.high, r.scale) for r in RANGES[scenario])
     return repr((SCHEMA, SHARE, SATURATED, ranges, COUNT, DWELL, PATIENCE, PAUSE))
 
@@ -158,7 +157,7 @@ def _factory(setup: Setup) -> ControllerFactory:
 
 
 def _offline(setup: Setup, objective: WorstCaseObjective, **options: Any) -> OfflinePosture:
-    """Optimize each problem once, because gains, pushes and contact laws do not change the problem."""
+    """Return the offline posture.  Points that differ in gains, pushes or contact laws share it."""
     demands = scenario_requirements(setup, objective, at_contact=options["at_contact"])
     impact = objective.contact, objective.metric, objective.kind, objective.supports, objective.compliance
     key = repr((setup.robot.source, setup.robot.data_sha256, setup.q.tobytes(), impact, demands, options))

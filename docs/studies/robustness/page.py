@@ -1,4 +1,4 @@
-"""Page about where controllers help, computed from the records: recommendations in sentences, then tables."""
+"""Page about where controllers help: recommendations, then tables.  Both are computed from stored records."""
 
 from __future__ import annotations
 
@@ -63,9 +63,6 @@ def _is_contact(name: str) -> bool:
     return name.startswith("aerial")
 
 
-# ---- what to choose -----------------------------------------------------------------------------------------------
-
-
 def _stiffness(records: Records) -> list[str]:
     """Compare the effect of the term's stiffness alone with the effect of the offline posture alone."""
     parts = []
@@ -124,9 +121,6 @@ def _predictors(records: Records) -> list[str]:
     ]
 
 
-# ---- tables -------------------------------------------------------------------------------------------------------
-
-
 def _overview(name: str, own: Sequence[Record], controller: str) -> list[str]:
     s = summarize(own, controller)
     cells = [f"{v}/{s.count}" for v in (s.helps, s.gentler)] + [spread(s.motion), percent(s.jump)]
@@ -180,7 +174,7 @@ def _part(part: Split) -> str:
 
 
 def _splits(records: Records) -> Iterator[str]:
-    """Compare results between random draws with small and large values of mounting, armature and gain K."""
+    """Compare random draws with small values of mounting, armature or gain K with draws with large values."""
     middle = {r.name: math.sqrt(r.low * r.high) for ranges in RANGES.values() for r in ranges if r.scale == "log"}
     words = {key: f"`{key}` below {middle[key]:.2g} × the scenario's" for key in ("armature", "gain")}
     body = []

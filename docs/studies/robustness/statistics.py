@@ -157,7 +157,7 @@ def ranks_of_jumps(records: Sequence[Record], names: Sequence[str]) -> dict[str,
 
 
 def fall(record: Record, controller: str, name: str) -> float | None:
-    """Return how far a predictor (ln of the ratio) or the offset (m) is below its nominal value before the impact."""
+    """Return the decrease of a predictor (logarithm of the ratio) or of the offset (m), relative to nominal."""
     if name == "offset":
         before, after = (record.documents[c]["offset"] for c in (NOMINAL, controller))
         return None if before is None or after is None else float(before - after)
@@ -166,7 +166,7 @@ def fall(record: Record, controller: str, name: str) -> float | None:
 
 
 def agreement(records: Sequence[Record], names: Sequence[str], of: str, metric: str) -> tuple[int, int]:
-    """Return the number of runs in which metric and predictor changed in the same direction, and of all runs."""
+    """Return in how many runs metric and predictor changed in the same direction, and the number of all runs."""
     same = [
         (fallen > 0) == (change(r, c, metric) < 0)
         for r in records
@@ -192,7 +192,7 @@ def worst(records: Sequence[Record], controller: str) -> Record | None:
 
 
 def misled(records: Sequence[Record], controller: str) -> Record | None:
-    """Return the record in which H fell most although the jump rose."""
+    """Return the record with the largest decrease of H among the records with an increased jump."""
     fine = [r for r in records if not r.failure(controller) and change(r, controller, "peak_jump") > 0]
     fallen = {k: fall(r, controller, "H") or 0.0 for k, r in enumerate(fine)}
     most = max(fallen, key=lambda k: fallen[k], default=None)

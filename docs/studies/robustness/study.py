@@ -22,8 +22,7 @@ from impact_posture.system.processes import fork_map
 def points(request: Request) -> Iterator[str]:
     """Run the points that are not stored yet, or repeat one point."""
     import_mujoco()
-    # Use a separate cache.  Every armature and mounting needs new libraries, which must not fill the cache of the
-    # user.
+    # Use a separate cache, because every armature and mounting needs new libraries.
     os.environ["IMPACT_POSTURE_CACHE"] = str(ROOT / "build" / "robustness" / "cache")
     scenarios = [name for name in RANGES if request.only in name]
     began = time.perf_counter()
@@ -64,8 +63,8 @@ def study(
 ) -> None:
     """Run the points that are missing in the store.
 
-    Points of the scenarios alternate, and all controllers run at a point before the next point begins.  So an
-    interrupted study has the same points for all controllers.
+    All controllers run at a point before the next point begins, so an interrupted study has the same points for all
+    controllers.  Successive points belong to different scenarios.
     """
     wanted = [(name, number) for number in range(max(points.values())) for name in points if number < points[name]]
     missing = [each for each in wanted if not is_complete(store.get(*each))]
