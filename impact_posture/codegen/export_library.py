@@ -85,7 +85,7 @@ class ExportLibrary:
         function: CasADi function ``(q, n, constants)`` → all outputs.
         constants: Values of the input ``constants``, which contains the constants in which repeated limbs differ.
         seeds: (input name, index) → limb to which the input belongs.
-        functions: The C functions.
+        functions: Name and outputs of each C function.
     """
 
     function: ca.Function

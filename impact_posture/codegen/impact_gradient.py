@@ -229,7 +229,7 @@ class ImpactGradient:
         H, grad = self.value_and_gradient(test["q"], test["n"])
         values, expected = np.array([H, *grad]), np.array([test["H"], *test["grad"]])
         difference = float(np.abs(values - expected).max() / np.abs(expected).max())
-        # The condition "difference > tolerance" would be False for NaN, so NaN would be accepted.
+        # The test is "not <=" instead of ">", because ">" is False for NaN.
         if not difference <= _SELF_TEST[self.manifest["real"]]:
             hint = "delete the library, so that it is built again"
             raise ManifestMismatch("reference value of H", test["H"], H, where=where, hint=hint)

@@ -137,7 +137,7 @@ def check_library(library: ctypes.CDLL, manifest: Mapping[str, Any], *, where: s
     """Check that a library belongs to a manifest, before any function of the library is called.
 
     Raises:
-        SpecError: The library does not identify its manifest.
+        SpecError: The library does not contain the hash of a manifest.
         ManifestMismatch: The library was built for another manifest; the error names the first difference.
     """
     symbol = f"{manifest['prefix']}_manifest"

@@ -219,7 +219,7 @@ def relaxation() -> dict[str, str]:
 
 
 def named(text: str, prefix: str) -> str:
-    """Return C text in which all names of the package begin with ``prefix`` instead of ``ip``."""
+    """Return C text in which all names that begin with ``ip`` begin with ``prefix`` instead."""
     text = re.sub(r"\brelaxation_([a-z])", rf"{prefix}_relaxation_\1", text)
     return re.sub(r"\bip_", f"{prefix}_", re.sub(r"\bIP_", f"{prefix.upper()}_", text))
 

@@ -102,7 +102,7 @@ def _falls(setup: Setup, series: Series) -> list[Event]:
 
 
 def _losses(setup: Setup, run: Run) -> list[Event]:
-    """Return violations of the bounds on relaxed and repeated commands, and the divergence of the state."""
+    """Return an event if too many ticks were relaxed, a command was repeated for too long, or the state diverged."""
     bounds, series, period = setup.scenario.bounds, run.series, setup.scenario.control.period
     events, relaxed = [], series.relaxed
     if relaxed.mean() > bounds.relaxed:

@@ -85,7 +85,7 @@ def run(factory: ControllerFactory, controller: str, *, seed: int = 0, mode: Mod
     if only not in (None, 1, -1):
         raise InputError(f"{only} is not a sign of a push", where=scenario.source, hint="give 1 or -1")
     task = scenario.task
-    assert not isinstance(task, RepeatedContacts)  # noqa: S101 (contacts have returned)
+    assert not isinstance(task, RepeatedContacts)  # noqa: S101 (the branch for contacts has returned)
     return _pushes(_Loop(factory, driver, seed), task, task.signs if only is None else (only,), mode)
 
 

@@ -82,7 +82,8 @@ class Report:
 
     Attributes:
         status: Result of the tick.
-        relaxed: Strict levels and limits that more important constraints prevent, the most important first.
+        relaxed: Strict levels and limits that cannot hold because of more important constraints, the most important
+            first.
         deficient: Strict levels that do not hold because their rows are dependent.  More important levels determine
             the same motion, rows contradict each other, or the posture is nearly singular (:class:`LevelRank`).
         residuals: Task name → ``ÿ − ÿ*``; the name ``contacts`` stands for all contacts.
@@ -263,7 +264,7 @@ class Controller:
         over = np.minimum(u, self.actuators.upper)
         np.maximum(over, self.actuators.lower, out=over)
         over -= u
-        # A test with ">" would accept NaN, so the code tests "not <=".
+        # The test is "not <=" instead of ">", because ">" is false for NaN.
         if not over.dot(over) <= self._excess:
             return self._held(Status.UNSOLVED, state.v)
         self._status = Status.RELAXED if outcome.relaxed else Status.SOLVED

@@ -207,7 +207,7 @@ static int ip_cholesky(double *A, int n)
   int i, k;
   for (i = 0; i < n; ++i) {
     double *row = A + i * n, s;
-    /* A test with "<=" would accept NaN. */
+    /* The test is not "<=", because "<=" is false for NaN. */
     if (!(row[i] > 0.0)) {
       return 0;
     }

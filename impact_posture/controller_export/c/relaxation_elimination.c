@@ -133,8 +133,8 @@ static void hold_rows(Relaxation *r, int held) {
     for (int i = 0; i < r->near; i++) r->held[r->close[i]] = held;
 }
 
-/* Move by r->step until a row of the program reaches its bound.  Return the entry of this row, or -1 after the whole
- * step. */
+/* Move by r->step until a row of the program reaches its bound, and return the entry of this row.  If no row reaches
+ * its bound, move by the whole step and return -1. */
 static int move(Relaxation *r) {
     double part = 1, end = 0;
     int stop = -1;
@@ -160,7 +160,7 @@ static int move(Relaxation *r) {
 static void eliminate(Relaxation *r, int rank) {
     const int n = r->n, free = n - r->fixed, rest = free - rank;
     if (rest < rank) {
-        /* If few coordinates remain, it is faster to multiply Z by each unit vector. */
+        /* If few coordinates remain, it is faster to multiply Z by the reflected unit vector of each coordinate. */
         for (int c = 0; c < rest; c++) {
             double *e = r->B + c * n;
             memset(e, 0, (size_t)free * sizeof *e);

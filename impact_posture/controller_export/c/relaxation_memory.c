@@ -38,7 +38,7 @@ typedef struct {
     int *held;                   /* whether each entry is eliminated */
     double *goal;                /* desired values of exact and close rows */
     double *B, *v, *tau, *rhs, *step, *column; /* work arrays of an elimination */
-    double *motion_z;                 /* Z times a step */
+    double *motion_z;            /* change of z by a step, Z times the step */
     int *rows, *lead, *close;    /* exact rows; exact row of the k-th reflection; close rows (least squares) */
     int exact, near, rank;       /* number of exact rows, of close rows, and of coordinates that the exact rows use */
     double *L, *wanted;          /* factor of the Hessian (1/L on the diagonal); minimum of the cost, whitened */

@@ -98,7 +98,7 @@ static void ip_answer(ip_context *c, ip_command *out)
     u[i] = ip_least(ip_most(exact, c->p.control_lower[i]), c->p.control_upper[i]);
     over += (exact - u[i]) * (exact - u[i]);
   }
-  /* A test with ">" would accept NaN. */
+  /* The test is not ">", because ">" is false for NaN. */
   if (!(over <= c->excess * c->excess)) {
     ip_hold(c, IP_UNSOLVED, c->v, out);
     return;

@@ -13,7 +13,7 @@ from impact_posture.tsid.support_contact import SupportContact
 
 # Share of the distance from the center of mass to an edge that accelerations may use.
 _SHARE = 0.8
-# Least distance from the center of mass to an edge in the bounds, m.
+# The bounds count a distance from the center of mass to an edge as at least this value, m.
 _LEAST = 0.01
 # If the squared length of a row in the free directions is smaller, no motion along these directions corrects the row.
 _TINY = 1e-12

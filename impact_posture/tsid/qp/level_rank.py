@@ -78,7 +78,7 @@ class LevelRank:
         moved = self._moved
         np.subtract(self._rows, self._reference, out=moved)
         moved *= self._scale
-        # A test with ">=" would be false for NaN, so the code tests "not <".
+        # The test is "not <" instead of ">=", because ">=" is false for NaN.
         if not self._flat.dot(self._flat) < self._room:
             self._measure()
         before = self.qp
