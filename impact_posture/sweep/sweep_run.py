@@ -58,8 +58,8 @@ def run_sweep(
         folder: Folder of the results.  If the folder contains an unfinished run of the same sweep, this run continues
             it.
         executor: A ``concurrent.futures.Executor``; ``None`` to solve in this process.
-        progress: Callback with the number of solved points and the number of all points to solve.  If a case has
-            several shards, each point is included twice, because each shard has two passes.
+        progress: Callback with the number of solved points and the number of all points to solve.  If shards have two
+            passes (:attr:`Sweep.passes`), each point counts twice.
         in_hand: Maximum number of shards that are submitted at the same time.
 
     Raises:

@@ -90,7 +90,7 @@ def _left_out(rows: Sequence[Row]) -> list[str]:
 
 
 def _verdicts(rows: Sequence[Row]) -> Iterator[str]:
-    """Yield whether ``√C``, ``√V`` (no friction) and ``√S`` (with friction) predict the jumps as well as intended."""
+    """Compare the errors of ``√C``, ``√V`` (no friction) and ``√S`` (with friction) with the allowed errors."""
     frictions = dict.fromkeys(row.surface.friction for row in rows)
     wanted = [("coulomb", mu, 0.95) for mu in frictions]
     for objective, mu, least in [

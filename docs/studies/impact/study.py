@@ -24,7 +24,7 @@ PICKED_FOR = 0.3
 LIGHTEST = "hextilt"
 # A contact point has slid if its tangential speed after the impact is more than this share of v_n.
 SLID = 0.01
-# For each robot: the case, the contact pose that random postures keep, and a description.
+# Robot → its optimization problem, the contact pose that random postures keep, and a description.
 STUDIED: dict[str, tuple[Case, str, str]] = {
     CASES[name].robot: (CASES[name], pose, words)
     for name, pose, words in (
@@ -137,7 +137,7 @@ class Row:
 
 @dataclass(frozen=True, eq=False)
 class Dropped:
-    """Random postures of one robot, in which it hits surfaces."""
+    """Random postures of one robot for simulated impacts."""
 
     robot: str
     scenes: tuple[tuple[Scene, ImpactQuantities], ...]

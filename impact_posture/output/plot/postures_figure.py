@@ -145,7 +145,7 @@ def side_plane(first: Skeleton, second: Skeleton) -> Plane:
         candidates = [plane for plane in candidates if not plane.contains(second.across)] or candidates
 
     def shown(plane: Plane) -> float:
-        # If there is little motion, the size of the robot in the plane decides.
+        # If there is little motion, prefer the plane in which the robot appears larger.
         seen = float(np.linalg.norm(motion @ plane.axes.T) + 0.2 * np.linalg.norm(size @ plane.axes.T))
         # A view from above is harder to read, so it is used only if it shows much more motion.
         return seen / 2 if plane is XY else seen
