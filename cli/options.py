@@ -51,7 +51,9 @@ RobotOrResult = Annotated[
 ]
 FrameList = Annotated[
     list[str] | None,
-    option("--frame", CONTACT, "Contact frame of a C library; repeatable.", metavar="F", show_default="the robot's"),
+    option(
+        "--frame", CONTACT, "Contact frame of a C library; repeatable.", metavar="F", show_default="from the robot"
+    ),
 ]
 Out = Annotated[str | None, out_option("Result folder.", "./ROBOT-FRAME")]
 Force = Annotated[bool, option("--force", OUTPUT, "Replace an existing result folder.")]

@@ -87,16 +87,16 @@ class LoadOptions(StrictTable):
         repeatable=True,
     )  # fmt: skip
     lock_massless: bool = setting(False, "Make all joints that move no mass rigid.", ROBOT)
-    root: Root | None = setting(None, "Joint between the world and the base.", ROBOT, words="robot.toml's")
+    root: Root | None = setting(None, "Joint between the world and the base.", ROBOT, words="from robot.toml")
     armature: str | Mapping[str, float] | None = setting(
         None, "Rotor inertia at the joint, kg·m²; JOINT=VALUE is repeatable.", ROBOT, "none|FILE|JOINT=VALUE",
-        "robot.toml's, else the SRDF's", parse=parse_armature, repeatable=True,
+        "from robot.toml, else the SRDF", parse=parse_armature, repeatable=True,
     )  # fmt: skip
     config: str | None = setting(
         None, "File of data that a URDF cannot contain.", ROBOT, "ROBOT.TOML", "beside the URDF"
     )
     srdf: str | None = setting(
-        None, "Named postures and rotor data: a path, or example-robot-data:PATH.", ROBOT, "FILE", "robot.toml's"
+        None, "Named postures and rotor data: a path, or example-robot-data:PATH.", ROBOT, "FILE", "from robot.toml"
     )
     package_dir: tuple[str, ...] = setting(
         (), "Folder of package:// paths; repeatable.", ROBOT, "DIR", repeatable=True
@@ -119,7 +119,7 @@ class RobotSettings(LoadOptions):
 class ImpactSettings(RobotSettings):
     """Settings of an impact of a robot; ``None`` selects the value of the robot."""
 
-    frame: str | None = setting(None, "Contact frame.", CONTACT, "F", "the robot's")
+    frame: str | None = setting(None, "Contact frame.", CONTACT, "F", "from the robot")
     normal: Direction | None = setting(
         None, "Direction out of the surface, of any length; required without --contact.", CONTACT, "X Y Z"
     )
@@ -163,10 +163,10 @@ class ImpactSettings(RobotSettings):
         parse=parse_payloads, repeatable=True,
     )  # fmt: skip
     posture: str | None = setting(
-        None, "Named posture, posture.json, or a JointState as .yaml.", ROBOT, "NAME|FILE", "the robot's"
+        None, "Named posture, posture.json, or a JointState as .yaml.", ROBOT, "NAME|FILE", "from the robot"
     )
     support: tuple[str, ...] | None = setting(
-        None, "Foot that stays on the ground; repeatable.", ROBOT, "FRAME[:point|surface]", "the robot's",
+        None, "Foot that stays on the ground; repeatable.", ROBOT, "FRAME[:point|surface]", "from the robot",
         repeatable=True,
     )  # fmt: skip
     support_compliance: float | None = None
@@ -186,23 +186,24 @@ class ProblemSettings(ImpactSettings):
     )
     contact_pose: Annotated[str, kind_or_tilt(get_args(ContactPose), "aligned")] | None = setting(
         None, "Hold the contact frame: full, position, aligned, aligned:DEG, free or box.", TASK, "KIND",
-        "robot.toml's, else full",
+        "from robot.toml, else full",
     )  # fmt: skip
     box: Lengths = setting((0.05, 0.05, 0.05), "Half extents of --contact-pose box, m.", TASK, "X Y Z")
     keep: tuple[str, ...] = setting((), "Hold the pose of another frame; repeatable.", TASK, "FRAME", repeatable=True)
     hold: tuple[str, ...] | None = setting(
-        None, "Keep a joint at its value; replaces robot.toml's joints; repeatable.", TASK, "JOINT", "robot.toml's",
-        repeatable=True,
+        None, "Keep a joint at its value; replaces the joints in robot.toml; repeatable.", TASK, "JOINT",
+        "from robot.toml", repeatable=True,
     )  # fmt: skip
     base: Annotated[str, kind_or_tilt(get_args(BaseMode), "level")] | None = setting(
-        None, "Hold a floating base: free, level, level:DEG, fixed or box.", TASK, "KIND", "robot.toml's, else free"
-    )
+        None, "Hold a floating base: free, level, level:DEG, fixed or box.", TASK, "KIND",
+        "from robot.toml, else free",
+    )  # fmt: skip
     base_box: Lengths = setting((0.2, 0.2, 0.2), "Half extents of --base box, m.", TASK, "X Y Z")
     com: bool | None = setting(
-        None, "Keep the center of mass above the feet.", LIMITS, words="robot.toml's", option="--com/--no-com"
+        None, "Keep the center of mass above the feet.", LIMITS, words="from robot.toml", option="--com/--no-com"
     )
     com_margin: NonNegative | None = setting(
-        None, "Distance of the center of mass from the support polygon's edges, m.", LIMITS, words="robot.toml's"
+        None, "Distance of the center of mass from the support polygon's edges, m.", LIMITS, words="from robot.toml"
     )
     keep_contacts: bool = setting(False, "The impact must neither lift nor slide a foot.", LIMITS)
     holdable: bool = setting(
@@ -238,7 +239,7 @@ class ProblemSettings(ImpactSettings):
     )  # fmt: skip
     obstacles: tuple[Obstacle, ...] = ()
     limit_margin: NonNegative | None = setting(
-        None, "Distance from the joint limits, rad or m.", LIMITS, words="robot.toml's"
+        None, "Distance from the joint limits, rad or m.", LIMITS, words="from robot.toml"
     )
     regularization: NonNegative = setting(0.0, "Weight of the distance from the start.", TASK)
     tradeoff: ZeroOrMore = setting(

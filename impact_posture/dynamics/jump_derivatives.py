@@ -113,7 +113,7 @@ class JumpDerivatives:
         return below + above.T
 
     def _at_feet(self, motions: ca.SX, joints: Sequence[int]) -> ca.SX:
-        """Return foot velocities: column j is for links after joint j that move with column j of ``motions``."""
+        """Return foot velocities; in column k, links after ``joints[k]`` have the velocity ``motions[:, k]``."""
         rows = [ca.SX(0, len(joints))]
         for foot, X in zip(self._feet, self._foot_motions, strict=True):
             rows.append(_kept(X @ motions, np.tile(self._lies_on([foot.point.joint], joints), (foot.rows, 1))))
