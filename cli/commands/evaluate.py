@@ -122,12 +122,13 @@ def _jumps(page: Page, impact: ResolvedImpact, evaluation: Evaluation) -> None:
     jumps = (evaluation.frictionless, evaluation.coulomb, evaluation.sticking)
     rows = [
         ("  ‖Δν‖", *(number(None if j is None else j.norm) for j in jumps), "jump"),
-        ("  impulse", *(number(None if j is None else j.impulse_size) for j in jumps), "N·s"),
+        ("  normal impulse", *(number(None if j is None else j.normal_impulse) for j in jumps), "N·s"),
+        ("  impulse, norm", *(number(None if j is None else j.impulse_size) for j in jumps), "N·s"),
         ("  energy lost", number(evaluation.energy_loss), "", "", "J"),
     ]
     if (compression := evaluation.compression) is not None and compression.time is not None:
-        rows.append(("  compressed for", number(1e3 * compression.time), "", "", "ms"))
-        rows.append(("  peak force", number(compression.peak_force), "", "", "N"))
+        rows.append(("  compressed for", "", number(1e3 * compression.time), "", "ms"))
+        rows.append(("  peak force", "", number(compression.peak_force), "", "N"))
     for name, unit, values in merged_entries(impact.robot, *jumps):
         rows.append((f"  Δν {name}", *(number(value, missing="") for value in values), unit))
     page.gap()
@@ -137,7 +138,9 @@ def _jumps(page: Page, impact: ResolvedImpact, evaluation: Evaluation) -> None:
         page.line(f"  with friction μ = {impact.contact.friction:g} the contact point {_slip(evaluation.coulomb)}")
     names = contact_names(impact.objective.contacts)
     for name, jump in zip(names, evaluation.together or (), strict=False):
-        page.line(f"  all at once, with friction: {name} {_slip(jump)}, impulse {number(jump.impulse_size)} N·s")
+        page.line(
+            f"  all at once, with friction: {name} {_slip(jump)}, normal impulse {number(jump.normal_impulse)} N·s"
+        )
 
 
 def _slip(jump: CoulombJump) -> str:
@@ -165,4 +168,4 @@ def _elastic(page: Page, impact: ResolvedImpact, response: ElasticResponse) -> N
     )
     rows += [(f"  largest torque of {name}", number(value), unit) for name, unit, value in largest[:5]]
     page.gap()
-    page.table((f"  elastic joints on {response.stiffness:.3g} N/m", "", "unit"), rows, right=(1,))
+    page.table((f"  elastic joints on {response.stiffness:.3g} N/m, without friction", "", "unit"), rows, right=(1,))

@@ -215,10 +215,16 @@ class ProblemSettings(ImpactSettings):
         0.0, "Force along the normal that the robot must also sustain after the impact, N.", LIMITS, "N"
     )
     max_force: Annotated[float, between(1e-6, 1e9, "N")] | None = setting(
-        None, "Bound on the peak force, N; needs --contact-stiffness or --contact-duration.", LIMITS, words="no bound"
+        None,
+        "Bound on the peak force, N; needs --contact-stiffness or --contact-duration.",
+        LIMITS,
+        words="no bound",
     )
     max_joint_jump: Annotated[float, between(1e-6, 1e9, "rad/s or m/s")] | None = setting(
-        None, "Bound on the frictionless velocity jump of each joint, rad/s or m/s.", LIMITS, words="no bound"
+        None,
+        "Bound on the velocity jump of each joint, with friction, rad/s or m/s.",
+        LIMITS,
+        words="no bound",
     )
     max_torque: Annotated[float, between(1e-6, 1e9, "N·m")] | None = setting(
         None, "Bound on the controller's torque after the jump, N·m; needs --velocity-gain.", LIMITS, words="no bound"

@@ -36,7 +36,7 @@ def quantities(metric: Metric) -> list[tuple[str, str, str]]:
 
 
 def quantity_rows(impact: ResolvedImpact, initial: dict[str, Any], optimal: dict[str, Any]) -> list[QuantityRow]:
-    """Return the rows of the objective, H to E, impulse (friction), peak force (no friction) and approach speed.
+    """Return the rows of the objective, H to E, normal impulse and peak force with friction, and approach speed.
 
     Unknown quantities have no row.  ``initial`` and ``optimal`` are the blocks of ``result.json``.
     """
@@ -47,12 +47,13 @@ def quantity_rows(impact: ResolvedImpact, initial: dict[str, Any], optimal: dict
     rows = [QuantityRow(key, initial[key], optimal[key], unit, words) for key, unit, words in named]
     jumps = [block["jump"]["coulomb"] for block in (initial, optimal)]
     forces = [(block["compression"] or {}).get("peak_force") for block in (initial, optimal)]
-    at = f"at {impact.speed:g} m/s"
+    at, friction = f"at {impact.speed:g} m/s", f", friction {impact.contact.friction:g}"
     if None not in jumps and impact.speed:
-        first, last = (sum(v * v for v in jump["impulse"]) ** 0.5 for jump in jumps)
-        rows.append(QuantityRow("impulse", first, last, "N·s", f"impulse {at}, friction {impact.contact.friction:g}"))
+        # Results of earlier versions do not have this number.
+        first, last = (jump.get("normal_impulse") for jump in jumps)
+        rows.append(QuantityRow("impulse", first, last, "N·s", f"normal impulse {at}{friction}"))
     if None not in forces:
-        rows.append(QuantityRow("force", forces[0], forces[1], "N", f"peak force {at}, no friction"))
+        rows.append(QuantityRow("force", forces[0], forces[1], "N", f"peak normal force {at}{friction}"))
     first, last = (block.get("attainable_speed") for block in (initial, optimal))
     if (first, last) != (None, None):
         rows.append(QuantityRow("approach", first, last, "m/s", "fastest within joint velocity limits"))

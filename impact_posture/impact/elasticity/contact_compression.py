@@ -1,16 +1,20 @@
 """Compression time and peak force of a contact, and the joint inertia (links, or links and rotors) that responds.
 
-An effective mass ``m = 1/G`` that meets a contact at the speed v comes to rest after the time T.  At T, the
-compression δ and the force reach their maxima; the largest force is F:
+An effective mass ``m`` that meets a contact at the speed v comes to rest after the time T.  At T, the compression δ
+and the normal force reach their maxima; the largest force is F:
 
 - linear contact, ``f = kδ``: ``T = (π/2)√(m/k)``, ``F = v√(km)``;
 - Hertzian contact, ``f = κδ^{3/2}`` (Johnson, Contact Mechanics, 1985, §11.4): ``δ = (5mv²/4κ)^{2/5}``,
   ``F = κδ^{3/2}``, ``T = 1.472 δ/v``;
 - contact of known T: treated as the linear contact with this T, ``F = (π/2) mv/T``.
 
-The ratio ``x = T √(G/C)`` determines whether the rotors behind elastic transmissions respond to the impact.  It
-compares T with the response time of the joint springs.  Here ``G = jM⁻¹jᵀ`` with the mass matrix of the links alone,
-``C = jK⁻¹jᵀ`` with the stiffness of the joint springs, and ``j = nᵀJ``.
+The mass is ``m = nᵀp/v`` with the impulse p of the plastic impact at the friction of the contact
+(:mod:`impact_posture.impact.friction.coulomb_impact`).  This is exact: while the normal force grows, the point sticks
+or slides along one constant direction, so the friction force is proportional to the normal force.
+
+The ratio ``x = T/√(m C)`` determines whether the rotors behind elastic transmissions respond to the impact.  It
+compares T with the response time of the joint springs.  Here ``m`` is the mass for the links alone, and ``C =
+jK⁻¹jᵀ`` with the stiffness of the joint springs and ``j = nᵀJ``.
 """
 
 from __future__ import annotations
@@ -21,8 +25,9 @@ from math import gamma, pi, sqrt
 import numpy as np
 
 from impact_posture.config.problem_settings import MATERIALS, JointModel
-from impact_posture.errors import InputError
+from impact_posture.errors import InputError, MetricError
 from impact_posture.impact.elasticity.elastic_impact import ElasticImpact
+from impact_posture.impact.friction.coulomb_impact import coulomb_impact
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.quantities.impact_oracle import ImpactOracle
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
@@ -71,35 +76,35 @@ class ContactStiffness:
             return ContactStiffness(hertz=hertz_stiffness(stiffness), material=stiffness)
         return None if stiffness is None else ContactStiffness(linear=stiffness)
 
-    def compression_time(self, G: float, speed: float) -> float:
-        """Return the compression time T, s, for ``G = 1/m`` (1/kg) and the approach speed (m/s)."""
+    def compression_time(self, mass: float, speed: float) -> float:
+        """Return the compression time T, s, for the effective mass (kg) and the approach speed (m/s)."""
         if self.duration is not None:
             return self.duration
         if self.linear is not None:
-            return pi / 2 / sqrt(self.linear * G)
-        return HERTZ_TIME * self._depth(G, speed) / speed if speed > 0 else float("inf")
+            return pi / 2 * sqrt(mass / self.linear)
+        return HERTZ_TIME * self._depth(mass, speed) / speed if speed > 0 else float("inf")
 
-    def peak_force(self, G: float, speed: float) -> float:
-        """Return the contact force at greatest compression, N; arguments as in :meth:`compression_time`."""
+    def peak_force(self, mass: float, speed: float) -> float:
+        """Return the normal force at greatest compression, N; arguments as in :meth:`compression_time`."""
         if self.duration is not None:
-            return pi / 2 * speed / (G * self.duration)
+            return pi / 2 * mass * speed / self.duration
         if self.linear is not None:
-            return speed * sqrt(self.linear / G)
-        return float((self.hertz or 0.0) * self._depth(G, speed) ** 1.5)
+            return speed * sqrt(self.linear * mass)
+        return float((self.hertz or 0.0) * self._depth(mass, speed) ** 1.5)
 
-    def _depth(self, G: float, speed: float) -> float:
+    def _depth(self, mass: float, speed: float) -> float:
         """Return the greatest compression of a Hertzian contact, m."""
-        return float((5 * speed**2 / (4 * (self.hertz or 0.0) * G)) ** 0.4)
+        return float((5 * mass * speed**2 / (4 * (self.hertz or 0.0))) ** 0.4)
 
-    def linear_stiffness(self, G: float, speed: float) -> float:
+    def linear_stiffness(self, mass: float, speed: float) -> float:
         """Return the stiffness k, N/m, of the linear contact that has the same compression time."""
-        return self.linear or (pi / 2 / self.compression_time(G, speed)) ** 2 / G
+        return self.linear or (pi / 2 / self.compression_time(mass, speed)) ** 2 * mass
 
-    def least_mobility(self, force: float, speed: float) -> float:
-        """Return the least G, 1/kg, for which the peak force does not exceed ``force``, N."""
-        # The peak force is proportional to G^(−power).
+    def largest_mass(self, force: float, speed: float) -> float:
+        """Return the largest effective mass, kg, for which the peak force does not exceed ``force``, N."""
+        # The peak force is proportional to mass^power.
         power = 1.0 if self.duration is not None else 0.5 if self.linear is not None else 0.6
-        return float((self.peak_force(1.0, speed) / force) ** (1 / power))
+        return float((force / self.peak_force(1.0, speed)) ** (1 / power))
 
     @property
     def words(self) -> str:
@@ -128,15 +133,18 @@ class Compression:
 
     Attributes:
         contact: Elasticity of the contact; ``None`` if not known.
-        time: Compression time T, s, with the inertia of the objective's joint model; ``None`` if not known.
-        peak_force: Peak force F, N, with the same inertia; ``None`` if not known.
-        x: Ratio ``T √(G/C)``, with T and G of the links alone; ``None`` if the contact or the springs are unknown.
+        mass: Effective mass m along the normal with the friction of the contact, kg, with the inertia of the
+            objective's joint model.
+        time: Compression time T, s, for this mass; ``None`` if not known.
+        peak_force: Largest normal force F, N, for this mass; ``None`` if not known.
+        x: Ratio ``T/√(m C)``, with T and m of the links alone; ``None`` if the contact or the springs are unknown.
         by_material: Name of a material → x for a contact with this material; empty unless the springs are known and
             the contact is not.
         joint_model: The joint model of the objective.
     """
 
     contact: ContactStiffness | None
+    mass: float
     time: float | None
     peak_force: float | None
     x: float | None
@@ -175,6 +183,7 @@ class Compression:
         """Return JSON content."""
         return {
             "contact": None if self.contact is None else self.contact.to_dict(),
+            "mass": self.mass,
             "compression_time": self.time,
             "peak_force": self.peak_force,
             "x": self.x,
@@ -187,43 +196,59 @@ class Compression:
 def compression(
     objective: WorstCaseObjective, q: Array, speed: float, contact: ContactStiffness | None
 ) -> Compression | None:
-    """Return compression time, peak force and x of the impact at the leading contact; ``None`` if all are unknown.
+    """Return compression time, peak force and x of the impact at the leading contact, with its friction.
 
-    ``q`` has shape (nq,), and ``speed`` is the approach speed, m/s.  If ``contact`` is ``None``, x is computed for
-    every material in :data:`MATERIALS`.
+    Return ``None`` if all are unknown, or if the contact point cannot move as the friction demands.  ``q`` has shape
+    (nq,), and ``speed`` is the approach speed, m/s.  If ``contact`` is ``None``, x is computed for every material in
+    :data:`MATERIALS`.
     """
-    springs = springs_along(objective.case, q)
-    quantities = objective.oracle.quantities(q)
-    if (contact is None and springs is None) or quantities.blocked:
+    springs, mass = springs_along(objective.case, q), contact_mass(objective.oracle, q)
+    if (contact is None and springs is None) or mass is None:
         return None
     time = force = x = None
     by_material: dict[str, float] = {}
     if contact is not None:
-        numbers = contact.compression_time(quantities.G, speed), contact.peak_force(quantities.G, speed)
+        numbers = contact.compression_time(mass, speed), contact.peak_force(mass, speed)
         time, force = (value if np.isfinite(value) else None for value in numbers)
     if springs is not None:
-        G, C = springs
+        links, C = springs
         if contact is not None:
-            x = contact.compression_time(G, speed) * sqrt(G / C)
+            x = contact.compression_time(links, speed) / sqrt(links * C)
         elif speed > 0:
             each = {name: ContactStiffness(hertz=hertz_stiffness(name)) for name in MATERIALS}
-            by_material = {name: steel.compression_time(G, speed) * sqrt(G / C) for name, steel in each.items()}
+            by_material = {
+                name: steel.compression_time(links, speed) / sqrt(links * C) for name, steel in each.items()
+            }
     if x is not None and not np.isfinite(x):
         x = None
-    return Compression(contact, time, force, x, by_material, objective.robot.joint_model)
+    return Compression(contact, mass, time, force, x, by_material, objective.robot.joint_model)
+
+
+def contact_mass(oracle: ImpactOracle, q: Array) -> float | None:
+    """Return the effective mass along the normal with friction at ``q``, kg.
+
+    Return ``None`` if it is unbounded, because the contact point cannot move along the normal, or not without the
+    slip that the friction prevents.
+    """
+    if oracle.quantities(q).blocked:
+        return None
+    try:
+        return coulomb_impact(oracle, q).mass
+    except MetricError:
+        return None
 
 
 def springs_along(case: ImpactCase, q: Array) -> tuple[float, float] | None:
-    """Return ``G = jM⁻¹jᵀ`` with the inertia of the links alone, 1/kg, and ``C = jK⁻¹jᵀ`` of the joint springs, m/N.
+    """Return the effective mass of the links alone, kg, and the compliance ``C = jK⁻¹jᵀ`` of the joint springs, m/N.
 
-    Return ``None`` if a force at the contact deflects no spring of known stiffness.
+    Return ``None`` if the mass is unbounded, or if a force at the contact deflects no spring of known stiffness.
     """
     try:
         compliance = ElasticImpact(case).compliance(q)
     except InputError:
         return None
-    links = replace(case, robot=with_joint_model(case.robot, "link"))
-    return (ImpactOracle(links).quantities(q).G, compliance) if compliance > 0 else None
+    mass = contact_mass(ImpactOracle(replace(case, robot=with_joint_model(case.robot, "link"))), q)
+    return None if mass is None or compliance <= 0 else (mass, compliance)
 
 
 def both_models(objective: WorstCaseObjective) -> dict[JointModel, WorstCaseObjective]:

@@ -32,12 +32,15 @@ class CoulombJump(Jump):
     slip_direction: Array | None
 
     @staticmethod
-    def of(jump: Jump, impulse: Array, friction: float, slip: Array) -> CoulombJump:
-        """Extend ``jump`` by the impulse and the slip velocity (per approach speed) of one contact, shapes (3,)."""
+    def of(jump: Jump, impulse: Array, n: Array, friction: float, slip: Array) -> CoulombJump:
+        """Extend ``jump`` by impulse, normal and slip velocity (per approach speed) of one contact, shapes (3,)."""
         size = float(np.linalg.norm(slip))
         direction = None if size <= _SLIP else slip / size
         return CoulombJump(
-            **vars(jump) | {"impulse": impulse}, friction=friction, sticks=direction is None, slip_direction=direction
+            **vars(jump) | {"impulse": impulse, "normal_impulse": float(n @ impulse)},
+            friction=friction,
+            sticks=direction is None,
+            slip_direction=direction,
         )
 
 
@@ -52,7 +55,7 @@ def coulomb_jump(objective: WorstCaseObjective, q: Array, rebound: float) -> Cou
         return None
     impulse = impact.impulse * rebound
     jump = weighed_jump(objective, impact.jump * rebound, impulse)
-    return CoulombJump.of(jump, impulse, objective.contact.friction, impact.slip)
+    return CoulombJump.of(jump, impulse, objective.oracle.n, objective.contact.friction, impact.slip)
 
 
 def coulomb_jumps(objective: WorstCaseObjective, q: Array, speed: float) -> tuple[CoulombJump, ...] | None:
@@ -75,5 +78,5 @@ def coulomb_jumps(objective: WorstCaseObjective, q: Array, speed: float) -> tupl
     after = (B @ p.ravel()).reshape(p.shape) - normals
     slips = after - normals * (after * normals).sum(1, keepdims=True)
     jump = weighed_jump(objective, speed * (responses @ p.ravel()), speed * p[0])
-    each = zip(speed * p, friction, slips, strict=True)
-    return tuple(CoulombJump.of(jump, impulse, float(mu), slip) for impulse, mu, slip in each)
+    each = zip(speed * p, normals, friction, slips, strict=True)
+    return tuple(CoulombJump.of(jump, impulse, n, float(mu), slip) for impulse, n, mu, slip in each)

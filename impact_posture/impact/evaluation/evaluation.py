@@ -19,6 +19,7 @@ from impact_posture.impact.elasticity.contact_compression import (
     ContactStiffness,
     both_models,
     compression,
+    contact_mass,
 )
 from impact_posture.impact.elasticity.elastic_impact import ElasticImpact, ElasticResponse
 from impact_posture.impact.evaluation.coulomb_jump import CoulombJump, coulomb_jump, coulomb_jumps
@@ -70,6 +71,7 @@ class Evaluation:
             one contact, for contacts that can pull, or if the iteration does not converge.
         energy_loss: Energy that the frictionless impact dissipates, J; ``None`` if the contact cannot move along the
             normal.
+        contact_mass: Effective mass along the normal with friction, kg; ``None`` if it is unbounded.
         compression: Compression time, peak force and the ratio x; ``None`` if all of them are unknown.
         elastic: Response of links, rotors and springs to the contact; ``None`` unless the joint model is ``elastic``.
         dominance: Share of the joint that contributes most to H.
@@ -100,6 +102,7 @@ class Evaluation:
     coulomb: CoulombJump | None
     together: tuple[CoulombJump, ...] | None
     energy_loss: float | None
+    contact_mass: float | None
     compression: Compression | None
     elastic: ElasticResponse | None
     dominance: Dominance
@@ -124,6 +127,7 @@ class Evaluation:
             **{key: content[key] for key in ("q", "objective")},
             **content["scalars"],
             "effective_mass": self.scalars.effective_mass,
+            "effective_mass_with_friction": self.contact_mass,
             **{key: content[key] for key in ("gradient", "objective_gradient", "worst_normal", "ellipsoid")},
             "pose": {"position": self.pose.translation.tolist(), "quaternion_xyzw": quaternion.coeffs().tolist()},
             "jump": {key: content[key] for key in _JUMP},
@@ -195,6 +199,7 @@ def evaluate(
         coulomb=None if scalars.E is None else coulomb_jump(objective, q, rebound),
         together=coulomb_jumps(objective, q, speed) if objective.others else None,
         energy_loss=None if scalars.E is None else scalars.E * speed**2 * (1 - restitution**2),
+        contact_mass=contact_mass(oracle, q),
         compression=squeezed,
         elastic=_elastic(objective, q, speed, contact_stiffness),
         dominance=find_dominance(objective, quantities),
@@ -234,8 +239,9 @@ def _elastic(
     if contact is None:
         hint = "add `contact_stiffness` (N/m, or a material) or `contact_duration`"
         raise InputError("elastic needs the elasticity of the contact", where="joint_model", hint=hint)
-    G = objective.oracle.quantities(q).G
-    return ElasticImpact(objective.case).response(q, contact.linear_stiffness(G, speed), speed)
+    # The elastic response has no friction, so the contact is matched to the effective mass without friction.
+    stiffness = contact.linear_stiffness(1 / objective.oracle.quantities(q).G, speed)
+    return ElasticImpact(objective.case).response(q, stiffness, speed)
 
 
 def _joint_model_warning(objective: WorstCaseObjective, q: Array, squeezed: Compression | None) -> tuple[str, ...]:

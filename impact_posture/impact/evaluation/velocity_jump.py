@@ -22,17 +22,19 @@ class Jump:
         velocity: Velocity jump ``Δν``, shape (nv,), m/s and rad/s.
         norm: Norm ``‖Δν‖_W``.
         impulse: Impulse of the surface on the robot, world axes, shape (3,), N·s.
+        normal_impulse: Part of the impulse along the normal, N·s.
         largest: Largest entries of ``Δν`` as ``(name, value, unit)``, in descending order.
     """
 
     velocity: Array
     norm: float
     impulse: Array
+    normal_impulse: float
     largest: tuple[tuple[str, float, str], ...]
 
     @property
     def impulse_size(self) -> float:
-        """Magnitude of the impulse, N·s."""
+        """Magnitude of the impulse, friction included, N·s."""
         return float(np.linalg.norm(self.impulse))
 
     def to_dict(self) -> dict[str, object]:
@@ -103,6 +105,10 @@ def sticking_jump(objective: WorstCaseObjective, quantities: ImpactQuantities, r
 
 
 def weighed_jump(objective: WorstCaseObjective, velocity: Array, impulse: Array) -> Jump:
-    """Return a :class:`Jump` from ``velocity``, shape (nv,), with its norm at the last posture of the oracle."""
+    """Return a :class:`Jump` from ``velocity``, shape (nv,), at the last posture of the oracle.
+
+    ``impulse`` acts at the leading contact, world axes, shape (3,).
+    """
     norm = float(np.sqrt(max(float(velocity @ objective.oracle.weigh(velocity)), 0.0)))
-    return Jump(velocity, norm, impulse, largest_entries(objective.robot, velocity))
+    along = float(objective.oracle.n @ impulse)
+    return Jump(velocity, norm, impulse, along, largest_entries(objective.robot, velocity))

@@ -18,7 +18,7 @@ import numpy as np
 
 from impact_posture.dynamics.spatial import cross
 from impact_posture.impact.quantities.impact_oracle import ImpactOracle
-from impact_posture.impact.quantities.sticking_point import no_sticking
+from impact_posture.impact.quantities.sticking_point import ImpulseResponse, no_sticking
 from impact_posture.system.arrays import Array
 
 # An eigenvalue of B_tt below this share of the trace of B is regarded as zero.
@@ -42,6 +42,9 @@ class CoulombImpact:
         impulse: Impulse of the surface on the robot, world, shape (3,).
         slip: Velocity of the contact point after the impact, world axes, shape (3,); zero if the point sticks.
         sigma: Multiplier ``σ``, 1/kg; zero if the point sticks, infinite if there is no friction.
+        mass: Effective mass ``m = nᵀp`` along the normal with friction, kg: the normal impulse per approach speed.
+            Without friction, ``m = 1/G``.  A spring along the normal is compressed as by this mass, because the
+            direction of the impulse is constant.
     """
 
     sticks: bool
@@ -49,6 +52,7 @@ class CoulombImpact:
     impulse: Array
     slip: Array
     sigma: float
+    mass: float
 
 
 def coulomb_impact(oracle: ImpactOracle, q: Array, *, other: bool = False) -> CoulombImpact:
@@ -62,10 +66,7 @@ def coulomb_impact(oracle: ImpactOracle, q: Array, *, other: bool = False) -> Co
     """
     quantities, friction = oracle.quantities(q), oracle.contact.friction
     n, B = quantities.normal, quantities.mobility
-    axes = np.linalg.svd(n[None, :])[2][1:].T
-    values, vectors = np.linalg.eigh(axes.T @ B @ axes)
-    kept = values > _RANK * np.trace(B)
-    values, tangents = values[kept], axes @ vectors[:, kept]
+    values, tangents = _tangential(n, B)
     g = tangents.T @ B @ n
 
     def excess(sigma: float) -> float:
@@ -74,7 +75,8 @@ def coulomb_impact(oracle: ImpactOracle, q: Array, *, other: bool = False) -> Co
     if (excess(0.0) <= 0) != other:
         if quantities.sticking_impulse is None or quantities.sticking_jump is None:
             raise no_sticking()
-        return CoulombImpact(True, quantities.sticking_jump, quantities.sticking_impulse, np.zeros(3), 0.0)
+        impulse = quantities.sticking_impulse
+        return CoulombImpact(True, quantities.sticking_jump, impulse, np.zeros(3), 0.0, float(n @ impulse))
     w, sigma = np.zeros(3), np.inf
     if friction > NO_FRICTION:
         least = -float(values[0]) * (1 - _RANK) if other and values.size else 0.0
@@ -82,8 +84,17 @@ def coulomb_impact(oracle: ImpactOracle, q: Array, *, other: bool = False) -> Co
             raise no_sticking()
         sigma = _multiplier(values, g, friction, least)
         w = tangents @ (g / (values + sigma))
-    impulse = (n - w) / float(n @ B @ (n - w))
-    return CoulombImpact(False, oracle.solve(oracle.J.T @ impulse), impulse, B @ impulse - n, sigma)
+    mass = 1 / float(n @ B @ (n - w))
+    impulse = mass * (n - w)
+    return CoulombImpact(False, oracle.solve(oracle.J.T @ impulse), impulse, B @ impulse - n, sigma, mass)
+
+
+def _tangential(n: Array, B: Array) -> tuple[Array, Array]:
+    """Return the eigenvalues of ``B_tt`` that are not zero, and their axes (columns), world, shape (3, k)."""
+    axes = np.linalg.svd(n[None, :])[2][1:].T
+    values, vectors = np.linalg.eigh(axes.T @ B @ axes)
+    kept = values > _RANK * np.trace(B)
+    return values[kept], axes @ vectors[:, kept]
 
 
 def _multiplier(values: Array, g: Array, friction: float, sigma: float) -> float:
@@ -104,22 +115,39 @@ def _multiplier(values: Array, g: Array, friction: float, sigma: float) -> float
 
 
 def coulomb_gradient(oracle: ImpactOracle, q: Array, impact: CoulombImpact) -> Array:
-    """Return the tangent gradient of ``C = ‖Δν‖²_W`` at unit approach speed, shape (nv,), of an impact at ``q``.
-
-    Let ``p`` be the impulse and ``K`` the matrix with ``∂w = K ∂B (n − w)``.  The gradient is ``∂_q pᵀΛ_c p + 2 ∂_q
-    rᵀBp`` for fixed ``p`` and ``r = −(Cn + K(JM⁻¹Wa − C Bn))``, all in the axes in which the normal is stated.
-    """
+    """Return the tangent gradient of ``C = ‖Δν‖²_W`` at unit approach speed, shape (nv,), of an impact at ``q``."""
     if impact.sticks or not np.isfinite(impact.sigma):
         return oracle.gradient_S(q) if impact.sticks else oracle.gradient_V(q)
-    quantities, p, weighed = oracle.quantities(q), impact.impulse, oracle.weigh(impact.jump)
-    n, B, value = quantities.normal, quantities.mobility, float(impact.jump @ weighed)
-    e = np.cross(n, p)
-    K = np.outer(e, e) / (e @ B @ e + impact.sigma * e @ e)
-    r = -value * n - K @ (oracle.J @ oracle.solve(weighed) - value * B @ n)
-    turned = oracle.axes.T
-    step = float(np.linalg.norm(p) / np.linalg.norm(r))
-    above, below = (oracle.gradient_G(q, turned @ (p + sign * step * r)) for sign in (1, -1))
-    return np.asarray(oracle.gradient_H(q, turned @ p) + (above - below) / (2 * step))
+    weighed = oracle.at(q).weigh(impact.jump)
+    (gradient,) = impact_gradients(oracle, q, impact, 2 * weighed[None, :], np.zeros(1))
+    return np.asarray(gradient + oracle.metric_gradient(impact.jump))
+
+
+def impact_gradients(oracle: ImpactOracle, q: Array, impact: CoulombImpact, covectors: Array, shares: Array) -> Array:
+    """Return the tangent gradient of ``cᵀΔν + s m`` for each covector ``c`` and share ``s``, shape (k, nv).
+
+    ``Δν`` is the jump of an impact at ``q`` and ``m`` its effective mass.  ``covectors`` has shape (k, nv) and is
+    constant; ``shares`` has shape (k,).  Let ``K`` be the matrix with ``∂w = K ∂B (n − w)``, and ``z = n − KBn``.
+    Then ``∂m = −m zᵀ∂B p`` and ``∂p = −(K + p zᵀ) ∂B p``, so each gradient is ``∂_q[cᵀM⁻¹Jᵀp − rᵀBp]`` with fixed
+    ``p`` and ``r = (K + z pᵀ)JM⁻¹c + s m z``, all in the axes in which the normal is stated.
+    """
+    quantities, p = oracle.quantities(q), impact.impulse
+    n, B = quantities.normal, quantities.mobility
+    K = np.zeros((3, 3))
+    if impact.sticks:
+        values, tangents = _tangential(n, B)
+        K = tangents / values @ tangents.T
+    elif np.isfinite(impact.sigma):
+        e = np.cross(n, p)
+        K = np.outer(e, e) / (e @ B @ e + impact.sigma * e @ e)
+    z = n - K @ B @ n
+    r = (K + np.outer(z, p)) @ oracle.J @ oracle.solve(covectors.T) + impact.mass * np.outer(z, shares)
+    x, y = oracle.respond(oracle.J.T @ p), oracle.respond(covectors.T - oracle.J.T @ r)
+    turned, in_frame, rows = oracle.axes.T, oracle.case.in_contact_frame, list[Array]()
+    for direction, a, f in zip(r.T, y.a.T, y.f.T, strict=True):
+        gradient = oracle.coupling(turned @ p, a, in_frame) - oracle.coupling(turned @ direction, x.a, in_frame)
+        rows.append(gradient - oracle.inertial(ImpulseResponse(a, f), x))
+    return np.array(rows).reshape(len(shares), oracle.robot.nv)
 
 
 def coulomb_direction(B: ca.SX, n: ca.SX, friction: float | ca.SX) -> tuple[ca.SX, ca.SX]:

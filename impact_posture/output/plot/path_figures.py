@@ -130,7 +130,7 @@ def share_notes(where: str, data: NullSpacePath | TradeOffData) -> str:
 
 _BOUNDS = {
     "distance": "distance moved from the initial posture, at most  [rad, mixed with m]",
-    "force": "peak force of the impact without friction, at most  [N]",
+    "force": "peak force of the impact, at most  [N]",
 }
 _EXTRA = {"distance": "distance", "force": "extra force"}
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from impact_posture.dynamics.numeric import Numeric
+from impact_posture.impact.elasticity.contact_compression import contact_mass
 from impact_posture.impact.evaluation.coulomb_jump import coulomb_jump, coulomb_jumps
 from impact_posture.impact.impact_contact import point_on
 from impact_posture.output.plot.result_view import ALONE, SEPARATOR, ResultView, header_lines, number
@@ -69,17 +70,18 @@ def _track(prepared: Prepared, view: ResultView) -> Track:
     impacts = [[single.oracle.quantities(at) for at in q] for single in objective.singles]
     jumps, impulses = _jumps(view, q)
     curves: list[Curve] = []
-    for contact, frames, sizes in zip(objective.contacts, impacts, impulses.T, strict=True):
-        where = f" at {contact.frame}" if objective.others else ""
-        curves += [*impact_curves(frames, prepared.impact.metric, where), (f"impulse{where}", "N·s", sizes)]
+    for single, frames, sizes in zip(objective.singles, impacts, impulses.T, strict=True):
+        where = f" at {single.contact.frame}" if objective.others else ""
+        curves += [*impact_curves(frames, prepared.impact.metric, where), (f"normal impulse{where}", "N·s", sizes)]
         if stiffness is not None:
-            peaks = np.array([stiffness.peak_force(impact.G, view.speed) for impact in frames])
-            curves.append((f"peak force{where}", "N", peaks))
+            masses = [contact_mass(single.oracle, at) for at in q]
+            peaks = [np.nan if mass is None else stiffness.peak_force(mass, view.speed) for mass in masses]
+            curves.append((f"peak force{where}", "N", np.array(peaks)))
     return Track("", times, unit, q, impacts, jumps, tuple(curves))
 
 
 def _jumps(view: ResultView, postures: Array) -> tuple[Array, Array]:
-    """Return the jump at each posture, shape (n, nv), and the impulse of each contact, N·s, shape (n, contacts).
+    """Return the jump at each posture, shape (n, nv), and the normal impulse of each contact, N·s, shape (n, contacts).
 
     All contacts act at once if their common jump is defined, otherwise only the first contact.  If the impact is
     undefined, the jump is zero and the impulse is NaN.
@@ -91,9 +93,9 @@ def _jumps(view: ResultView, postures: Array) -> tuple[Array, Array]:
         if together:
             several = coulomb_jumps(objective, q, view.speed) or ()
             for i, jump in enumerate(several):
-                jumps[k], impulses[k, i] = jump.velocity, jump.impulse_size
+                jumps[k], impulses[k, i] = jump.velocity, jump.normal_impulse
         elif (single := coulomb_jump(objective, q, rebound)) is not None:
-            jumps[k], impulses[k, 0] = single.velocity, single.impulse_size
+            jumps[k], impulses[k, 0] = single.velocity, single.normal_impulse
         elif (impact := objective.oracle.quantities(q)).G > 0:
             jumps[k], impulses[k, 0] = rebound / impact.G * impact.jump, rebound / impact.G
     return jumps, impulses

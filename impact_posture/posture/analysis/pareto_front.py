@@ -28,6 +28,7 @@ from impact_posture.config.checked import checked
 from impact_posture.config.demand import OneOrMore
 from impact_posture.config.problem_settings import TRADEOFF_POINTS
 from impact_posture.errors import InputError, MetricError
+from impact_posture.impact.effective_mass_objective import EffectiveMassObjective
 from impact_posture.impact.elasticity.contact_compression import ContactStiffness
 from impact_posture.posture.analysis.trade_off import TradeOff, TradePoint, find_knee
 from impact_posture.posture.analysis.trade_off_price import DistancePrice, ForcePrice, TradeOffPrice
@@ -97,9 +98,9 @@ def _price(
     if objective.others:
         fault = "bounds the force of one contact, but there are several contacts"
         raise InputError(fault, where="tradeoff_against", hint="give one `contact`")
-    # The force decreases as G increases, so the posture with the least E = 1/(2G) has the least force.
-    energy = replace(objective, kind="energy", normal_cone_deg=0.0, model_variants=())
-    least = solve(replace(problem, objective=energy), starts=_FORCE_STARTS, compile=compile, guesses=[solution.q])
+    # The posture with the least effective mass has the least force.
+    mass = EffectiveMassObjective.of(objective)
+    least = solve(replace(problem, objective=mass), starts=_FORCE_STARTS, compile=compile, guesses=[solution.q])
     return ForcePrice(objective, contact, speed, least.q)
 
 

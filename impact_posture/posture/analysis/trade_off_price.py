@@ -10,6 +10,7 @@ import pinocchio as pin
 from impact_posture.config.problem_settings import Against
 from impact_posture.dynamics.chart import Chart
 from impact_posture.impact.elasticity.contact_compression import ContactStiffness
+from impact_posture.impact.friction.coulomb_impact import coulomb_impact
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.posture.constraints.constraint import Constraint
 from impact_posture.posture.constraints.impact_bounds import ImpactBounds
@@ -46,7 +47,7 @@ class DistancePrice:
 
 @dataclass(frozen=True, eq=False)
 class ForcePrice:
-    """The peak force of the impact without friction, N; it decreases as G increases."""
+    """The peak force of the impact with friction, N; it increases with the effective mass."""
 
     objective: WorstCaseObjective
     contact: ContactStiffness
@@ -56,10 +57,10 @@ class ForcePrice:
     nothing: str = "the optimum has the least force"
 
     def measure(self, q: Array) -> float:
-        return self.contact.peak_force(self.objective.oracle.quantities(q).G, self.speed)
+        return self.contact.peak_force(coulomb_impact(self.objective.oracle, q).mass, self.speed)
 
     def bound(self, level: float) -> Constraint:
-        return ImpactBounds(self.objective, self.contact.least_mobility(level, self.speed), float("inf"))
+        return ImpactBounds(self.objective, self.contact.largest_mass(level, self.speed), float("inf"))
 
     def within(self, q: Array, level: float) -> Array:
         return q

@@ -27,9 +27,9 @@ class PredictedImpact:
     """The predicted impact in one posture at the given approach speed; ``jump`` is ``‖Δν‖_W``.
 
     Attributes:
-        impulse: Magnitude of the impulse at the first contact, N·s.
-        peak_force: Peak force without friction, N; ``None`` if no contact stiffness is given, or for several
-            contacts.
+        impulse: Normal impulse at the first contact, N·s.
+        peak_force: Largest normal force with the friction of the contact, N; ``None`` if no contact stiffness is
+            given, or for several contacts.
         sticks: Whether the first contact point sticks; ``None`` if the jump was computed without friction.
     """
 
@@ -51,8 +51,8 @@ class Verdict:
         outcome: Verdict in a few words, one of the values of ``Outcome``.
         line: One sentence that describes the verdict.
         jump: Relative change of ``‖Δν‖_W``; ``None`` if it is unknown.
-        impulse: Relative change of the magnitude of the impulse.
-        peak_force: Relative change of the peak force without friction; ``None`` if it is unknown.
+        impulse: Relative change of the normal impulse.
+        peak_force: Relative change of the peak force with friction; ``None`` if it is unknown.
         advice: Advice, one line each: the jump without friction, a better objective, or a more accurate joint model.
         before, after: The predicted impact in the initial and in the optimal posture; ``None`` if it is unknown.
         assumptions: Assumptions behind the numbers, one line each.
@@ -76,16 +76,17 @@ class Verdict:
 def verdict(impact: ResolvedImpact, before: Evaluation, after: Evaluation) -> Verdict:
     """Compare the predicted jumps of the initial and the optimal posture.
 
-    Jumps include the friction of the contact.  Peak forces are for the given contact stiffness, or for a linear
-    contact of any stiffness, ``F ∝ √m``.  Several contacts are struck at the same time.  If the jump of this impact
-    is unknown at one of the postures, only the first contact is compared.
+    Jumps, impulses and forces include the friction of the contact.  Peak forces are for the given contact stiffness,
+    or for a linear contact of any stiffness, ``F ∝ √m`` with the effective mass m with friction.  Several contacts
+    are struck at the same time.  If the jump of this impact is unknown at one of the postures, only the first contact
+    is compared.
     """
     together = bool(before.together and after.together)
     pair = _jump(before, together), _jump(after, together)
     if impact.speed <= 0 or pair[0] is None or pair[1] is None:
         why = "there is no approach speed" if impact.speed <= 0 else "the contact cannot move along the normal"
         return Verdict("unknown", f"no verdict: {why}.", None, None, None, ())
-    jump, impulse = _change(pair[0].norm, pair[1].norm), _change(pair[0].impulse_size, pair[1].impulse_size)
+    jump, impulse = _change(pair[0].norm, pair[1].norm), _change(pair[0].normal_impulse, pair[1].normal_impulse)
     force = _force_change(before, after)
     outcome: Outcome = "better at the price of impulse" if impulse > _SAME else "better"
     if (force or 0.0) > _SAME:
@@ -97,7 +98,8 @@ def verdict(impact: ResolvedImpact, before: Evaluation, after: Evaluation) -> Ve
     where = f" at {impact.contact.frame}" if together else ""
     parts = [
         f"the jump {_in_words(jump)} ({pair[0].norm:.3g} to {pair[1].norm:.3g}{_slip(pair[1])})",
-        f"the impulse{where} {_in_words(impulse)} ({pair[0].impulse_size:.3g} to {pair[1].impulse_size:.3g} N·s)",
+        f"the normal impulse{where} {_in_words(impulse)} "
+        f"({pair[0].normal_impulse:.3g} to {pair[1].normal_impulse:.3g} N·s)",
     ]
     if force is not None:
         parts.append(f"the peak force {_in_words(force)}{_newtons(before, after)}")
@@ -119,19 +121,21 @@ def _predicted(evaluation: Evaluation, jump: Jump) -> PredictedImpact:
     # If several contacts are struck at the same time, their forces are unknown.
     compression = None if evaluation.contacts else evaluation.compression
     peak = None if compression is None else compression.peak_force
-    return PredictedImpact(jump.norm, jump.impulse_size, peak, jump.sticks if isinstance(jump, CoulombJump) else None)
+    return PredictedImpact(
+        jump.norm, jump.normal_impulse, peak, jump.sticks if isinstance(jump, CoulombJump) else None
+    )
 
 
 def _assumptions(impact: ResolvedImpact, jump: Jump, together: bool, force: float | None) -> tuple[str, ...]:
-    friction = f"friction {impact.contact.friction:g}" if isinstance(jump, CoulombJump) else "no friction"
+    friction = f"with friction {impact.contact.friction:g}" if isinstance(jump, CoulombJump) else "without friction"
     # Impacts at several contacts at the same time are treated as plastic.
     restitution = 0.0 if together else impact.restitution
     stated = "the stated contact" if impact.contact_stiffness else "a linear contact, the same before and after"
     return (
-        f"rigid impact at {impact.speed:g} m/s with restitution {restitution:g} and {friction}",
+        f"rigid impact at {impact.speed:g} m/s with restitution {restitution:g}, {friction}",
         f"jump in the {impact.objective.metric.kind} metric, with joint model '{impact.robot.joint_model}'",
         *(("the feet stay on the ground",) if impact.objective.supports else ()),
-        *((f"peak force of {stated}, without friction",) if force is not None else ()),
+        *((f"peak force of {stated}, {friction}",) if force is not None else ()),
     )
 
 
@@ -157,12 +161,12 @@ def _slip(jump: Jump) -> str:
 
 
 def _force_change(before: Evaluation, after: Evaluation) -> float | None:
-    if before.contacts or before.scalars.E is None or after.scalars.E is None:
+    if before.contacts or before.contact_mass is None or after.contact_mass is None:
         return None
     first, second = before.compression, after.compression
     if first and second and first.peak_force is not None and second.peak_force is not None:
         return _change(first.peak_force, second.peak_force)
-    return sqrt(before.scalars.G / after.scalars.G) - 1
+    return sqrt(after.contact_mass / before.contact_mass) - 1
 
 
 def _newtons(before: Evaluation, after: Evaluation) -> str:

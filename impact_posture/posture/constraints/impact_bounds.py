@@ -1,13 +1,15 @@
 """Bounds on the peak force of an impact and on the velocity jump of each joint.
 
-Without friction, the velocity jump of the joints is ``Δν = a (1+e) v/G`` with ``a = M⁻¹Jᵀn`` and ``G = nᵀJa``, and
-the peak force decreases as G increases (:mod:`impact_posture.impact.elasticity.contact_compression`).  A joint
-controller with the velocity gain ``K_d`` responds to the jump with the torque ``K_d Δν``.  A bound on the torque
-``K_d Δν`` is therefore a bound on the jump (Wang et al. 2020, arXiv:2006.01987).
+With the impulse ``p`` per approach speed at the friction of the contact, the joints jump by ``Δν = (1+e) v M⁻¹Jᵀp``,
+and the peak force increases with the effective mass ``m = nᵀp``
+(:mod:`impact_posture.impact.elasticity.contact_compression`).  A joint controller with the velocity gain ``K_d``
+responds to the jump with the torque ``K_d Δν``.  A bound on the torque ``K_d Δν`` is therefore a bound on the jump
+(Wang et al. 2020, arXiv:2006.01987).
 """
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 
 import casadi as ca
@@ -15,72 +17,121 @@ import numpy as np
 
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import Tree
-from impact_posture.impact.quantities.lifted_form import impact_at
-from impact_posture.impact.support_compliance import support_inertia
+from impact_posture.errors import MetricError
+from impact_posture.impact.friction.coulomb_impact import (
+    NO_FRICTION,
+    CoulombImpact,
+    coulomb_impact,
+    impact_gradients,
+)
+from impact_posture.impact.quantities.lifted_form import Guess
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
-from impact_posture.posture.constraints.constraint import ExpressionConstraint, digest
+from impact_posture.posture.constraints.constraint import Constraint, LiftedRows, Linearization, digest
 from impact_posture.system.arrays import Array
 
+# At a posture where the contact point begins to slip, the values for sticking and sliding differ by less than this
+# share, and the certificate uses the gradients of both.
+_KINK = 1e-6
 
-class ImpactBounds(ExpressionConstraint):
-    """Bounds ``1/G(q) ≤ 1/G_min`` and, at every joint, ``|a_i(q)|/G(q) ≤ b``, for the first contact of the objective.
 
-    ``G_min`` and ``b`` are bounds of rows, so the same program can be used for all values of ``G_min`` and ``b``.
+class ImpactBounds(Constraint):
+    """Bounds ``m(q) ≤ m_max`` and, at every joint, ``|Δν_i(q)| ≤ b`` per approach speed, for the first contact.
+
+    Jump and impulse are unknowns of the program, with the equations of the objective ``coulomb``, or of ``speed`` if
+    there is no friction.  ``m_max`` and ``b`` are bounds of rows, so one program can be used for all their values.
 
     Args:
-        least_mobility: ``G_min``, 1/kg, the least G at which the peak force satisfies its bound; 0 for no bound.
+        largest_mass: ``m_max``, kg, the largest effective mass with friction at which the peak force satisfies its
+            bound; infinite for no bound.
         jump: ``b = Δν_max/((1+e) v)``, the largest allowed velocity jump of a joint per approach speed; infinite for
             no bound.
     """
 
-    def __init__(self, objective: WorstCaseObjective, least_mobility: float, jump: float, variant: str = "") -> None:
+    def __init__(self, objective: WorstCaseObjective, largest_mass: float, jump: float, variant: str = "") -> None:
         where = f" ({variant})" if variant else ""
         self.name = f"bounds on the impact{where}"
-        self._objective = replace(objective, normal_cone_deg=0.0)
+        self._slips = objective.contact.friction > NO_FRICTION
+        self._objective = replace(objective, kind="coulomb" if self._slips else "speed", normal_cone_deg=0.0)
         robot = objective.robot
         moving = np.isfinite(robot.model.armature) & (np.arange(robot.nv) >= (6 if robot.floating else 0))
         self._joints = np.flatnonzero(moving) if np.isfinite(jump) else np.zeros(0, dtype=int)
-        self._least, self._jump = least_mobility, jump
+        self._largest, self._jump = largest_mass, jump
         self.parameters = np.array(objective.contact.normal)
-        # The row of the peak force is 1/G and not G, because G_min can be much larger than every attainable G.
-        mass = [1 / least_mobility] if least_mobility > 0 else []
-        count = len(self._joints)
+        mass, count = [largest_mass] * bool(np.isfinite(largest_mass)), len(self._joints)
         self._names = [f"peak force{where}"] * len(mass)
         self._names += [f"jump of {robot.tangent_names[int(k)]}{where}" for k in self._joints]
         self._units = ["in kg of effective mass"] * len(mass) + ["in rad/s (m/s) per m/s of approach"] * count
         self.lower = np.array([*[-np.inf] * len(mass), *[-jump] * count])
         self.upper = np.array([*mass, *[jump] * count])
+        # Covector c and share s of each row, whose value is cᵀΔν + s m.
+        self._covectors = np.vstack([np.zeros((len(mass), robot.nv)), np.eye(robot.nv)[self._joints]])
+        self._shares = np.array([*[1.0] * len(mass), *[0.0] * count])
 
     def describe(self) -> str:
-        parts = [f"effective mass at most {1 / self._least:.4g} kg (peak force)"] if self._least > 0 else []
+        limited = np.isfinite(self._largest)
+        parts = [f"effective mass at most {self._largest:.4g} kg (peak force, with friction)"] if limited else []
         if len(self._joints):
-            parts.append(f"joint velocities jump by at most {self._jump:.4g} per m/s of approach")
+            parts.append(f"joint velocities jump by at most {self._jump:.4g} per m/s of approach, with friction")
         return f"{self.name}: {', '.join(parts)}"
 
     @property
     def structure(self) -> str:
-        return f"{super().structure}:{digest(self._least > 0, self._joints, self._objective.structure)}"
+        return f"{super().structure}:{digest(self._shares, self._joints, self._objective.structure)}"
 
-    def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
-        case = self._objective.case
-        extra = support_inertia(case.robot, case.supports, case.compliance)
-        heavy = Tree(case.robot.model, tree.q, extra_inertia=extra)
-        impact = impact_at(case, parameters)
-        response = heavy.respond(wrenches=[impact])
-        G = ca.dot(heavy.link_force(impact), response.velocities[impact.point.joint])
-        rows = [1 / G] if self._least > 0 else []
-        return ca.densify(ca.vertcat(*rows, *[response.a[int(k)] / G for k in self._joints]))
+    @property
+    def unknowns(self) -> int:
+        # Without friction, the impulse is one unknown; with friction, size, direction and two complementary ones.
+        return self._motion + (6 if self._slips else 1)
+
+    @property
+    def _motion(self) -> int:
+        """Number of unknowns of the jump and the support impulses, which is also the number of their equations."""
+        return self._objective.robot.nv + sum(support.rows for support in self._objective.supports)
+
+    @property
+    def lifted_bounds(self) -> tuple[Array, Array]:
+        equations = np.zeros(self._motion + (5 if self._slips else 1))
+        corner = np.zeros(1 if self._slips else 0)
+        lower = np.concatenate([equations, np.full_like(corner, -np.inf), self.lower])
+        return lower, np.concatenate([equations, corner, self.upper])
+
+    def lift(self, tree: Tree, parameters: ca.SX) -> LiftedRows:
+        lifted = self._objective.impact_kind.lift(tree, parameters, ca.SX(1))
+        mass = [lifted.variables[self._motion]] if np.isfinite(self._largest) else []
+        bounded = [*mass, *(lifted.variables[int(k)] for k in self._joints)]
+        return LiftedRows(ca.densify(ca.vertcat(lifted.residual, lifted.inequalities, *bounded)), lifted.variables)
+
+    def guess(self, model: Numeric) -> Guess:
+        return self._objective.impact_kind.guess(model.q, 1.0)
 
     def evaluate(self, model: Numeric) -> tuple[Array, Array]:
-        oracle, k = self._objective.oracle, self._joints
-        quantities, slope = oracle.quantities(model.q), oracle.gradient_G(model.q)
-        G, jump = quantities.G, quantities.jump[k] / quantities.G
-        gradients = np.zeros((0, slope.size))
-        if len(k):
-            gradients = (oracle.jump_gradient(model.q)[k] - np.outer(jump, slope)) / G
-        if self._least > 0:
-            return np.append(1 / G, jump), np.vstack([-slope / G**2, gradients])
-        return jump, gradients
+        impact = coulomb_impact(self._objective.oracle, model.q)
+        gradients = impact_gradients(self._objective.oracle, model.q, impact, self._covectors, self._shares)
+        return self._value(impact), gradients
+
+    def value(self, model: Numeric) -> Array:
+        return self._value(coulomb_impact(self._objective.oracle, model.q))
+
+    def _value(self, impact: CoulombImpact) -> Array:
+        return np.asarray(self._covectors @ impact.jump + impact.mass * self._shares)
+
+    def linearize(self, model: Numeric, auxiliaries: Array) -> Linearization:
+        """Linearize the bounded quantities as functions of the posture; the auxiliaries do not appear.
+
+        Where the contact point begins to slip, the rows for sticking and for sliding are both included, because the
+        quantities have a kink there.
+        """
+        oracle, (value, gradients) = self._objective.oracle, self.evaluate(model)
+        sides = [(value, gradients)]
+        with suppress(MetricError):
+            other = coulomb_impact(oracle, model.q, other=True)
+            if np.abs(self._value(other) - value).max(initial=0.0) <= _KINK * np.abs(value).max(initial=0.0):
+                sides.append((value, impact_gradients(oracle, model.q, other, self._covectors, self._shares)))
+        values, slopes = (np.concatenate(parts) for parts in zip(*sides, strict=True))
+        lower, upper = (np.tile(side, len(sides)) for side in (self.lower, self.upper))
+        # The certificate expects a column for each auxiliary.
+        auxiliary = np.zeros((len(values), len(auxiliaries)))
+        return Linearization(self._names * len(sides), values, lower, upper, slopes, auxiliary)
 
     def conflicts(self, excess: Array) -> dict[str, float]:
         rows = zip(self._names, self._units, excess.tolist(), strict=True)

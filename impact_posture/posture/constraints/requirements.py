@@ -37,7 +37,8 @@ class Requirements:
             posture.
         hold_force: Force of the surface on each contact after the impact, N; the robot must also be able to hold its
             posture under this force.
-        least_mobility: Least allowed G of each contact, 1/kg, from the bound on the peak force; 0 for no bound.
+        largest_mass: Largest allowed effective mass of each contact with friction, kg, from the bound on the peak
+            force; infinite for no bound.
         largest_jump: Largest allowed velocity jump of a joint per approach speed; infinite for no bound.
         approach_speed: Speed that the joints must be able to give the contact towards the surface, m/s; 0 for no
             requirement.
@@ -66,7 +67,7 @@ class Requirements:
     holdable: bool = False
     limit_share: float = 1.0
     hold_force: float = 0.0
-    least_mobility: float = 0.0
+    largest_mass: float = float("inf")
     largest_jump: float = float("inf")
     approach_speed: float = 0.0
     collision: bool = False

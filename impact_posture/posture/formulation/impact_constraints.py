@@ -40,7 +40,7 @@ def impact_constraints(
             added += [CenterOfMassOverFeet(c.normals, c.offsets, c.margin, loaded) for c in centers]
         if requirements.keep_contacts:
             added += [KeptContacts(single, numeric, requirements.friction, name) for single in member.singles]
-        limits = requirements.least_mobility, requirements.largest_jump
+        limits = requirements.largest_mass, requirements.largest_jump
         bounds = [ImpactBounds(single, *limits, name) for single in member.singles]
         # ImpactBounds has no rows if the settings limit nothing, or if all joints are locked.
         added += [bound for bound in bounds if bound.rows]

@@ -122,7 +122,7 @@ def requirements(settings: ProblemSettings, objective: Objective) -> Requirement
         com_over_feet=com,
         com_asked=settings.com is not None,
         com_margin=spec.com_margin if settings.com_margin is None else settings.com_margin,
-        least_mobility=_least_mobility(settings),
+        largest_mass=_largest_mass(settings),
         largest_jump=_largest_jump(settings),
         limit_margin=spec.limit_margin if settings.limit_margin is None else settings.limit_margin,
     )
@@ -130,8 +130,8 @@ def requirements(settings: ProblemSettings, objective: Objective) -> Requirement
     return replace(worked_out, **{key: getattr(settings, key) for key in shared})
 
 
-def _least_mobility(settings: ProblemSettings) -> float:
-    """Return the least G, 1/kg, at which the peak force is at most ``max_force``; 0 if there is no bound."""
+def _largest_mass(settings: ProblemSettings) -> float:
+    """Return the largest mass, kg, at which the peak force is at most ``max_force``; infinite for no bound."""
     for name, asked in (
         ("max_force", settings.max_force is not None),
         ("tradeoff_against", settings.tradeoff > 0 and settings.tradeoff_against == "force"),
@@ -144,8 +144,8 @@ def _least_mobility(settings: ProblemSettings) -> float:
             raise InputError("needs an approach speed", where=name, hint="give `speed` above zero")
     contact = ContactStiffness.of(settings.contact_stiffness, settings.contact_duration)
     if settings.max_force is None or contact is None:
-        return 0.0
-    return contact.least_mobility(settings.max_force, settings.speed)
+        return float("inf")
+    return contact.largest_mass(settings.max_force, settings.speed)
 
 
 def _largest_jump(settings: ProblemSettings) -> float:

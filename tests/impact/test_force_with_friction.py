@@ -1,0 +1,115 @@
+"""Peak force, compression time and effective mass with friction, against an integrated contact; their gradients."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from impact_posture.config.problem_settings import ProblemSettings
+from impact_posture.config.table_validation import validate
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.impact.effective_mass_objective import EffectiveMassObjective
+from impact_posture.impact.elasticity.contact_compression import ContactStiffness, compression
+from impact_posture.impact.friction.coulomb_impact import coulomb_impact
+from impact_posture.impact.impact_contact import ImpactContact
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.posture.analysis.verdict import verdict
+from impact_posture.posture.constraints.impact_bounds import ImpactBounds
+from impact_posture.posture.formulation.problem_file import prepare
+from impact_posture.posture.search.multistart import solve
+from tests.support.helpers import (
+    central_gradient,
+    frame_jacobian,
+    mass_matrix,
+    random_configurations,
+    relative,
+    robot,
+)
+from tests.support.settings import make_settings
+from tests.support.spring_contact import spring_impact
+
+FRAMES = {"tilthex_arm": "ee", "panda": "panda_hand_tcp", "ur5": "tool0"}
+
+
+def struck(name: str, friction: float, normal: tuple[float, float, float] = (0.3, 0.1, 1.0)) -> WorstCaseObjective:
+    return WorstCaseObjective(robot(name), ImpactContact(FRAMES[name], normal, friction=friction))
+
+
+@pytest.mark.parametrize("name", FRAMES)
+@pytest.mark.parametrize("friction", [0.0, 0.2, 3.0])
+def test_force_and_time_equal_an_integrated_contact_with_friction(name: str, friction: float) -> None:
+    objective, speed, seen = struck(name, friction), 0.7, set()
+    (q,) = random_configurations(objective.robot.model, 1, name, "force")
+    n = np.array(objective.contact.normal)
+    model = objective.robot.model
+    J = frame_jacobian(model, q, objective.robot.frame_id(objective.contact.frame))[:3]
+    for contact, power in ((ContactStiffness(linear=2e5), 1.0), (ContactStiffness(hertz=3e7), 1.5)):
+        stiffness = contact.linear or contact.hertz or 0.0
+        stepped = spring_impact(mass_matrix(model, q), J, n, friction, stiffness, speed, power=power)
+        predicted = compression(objective, q, speed, contact)
+        assert predicted is not None and predicted.peak_force is not None and predicted.time is not None
+        assert predicted.peak_force == pytest.approx(stepped.force, rel=1e-3)
+        assert predicted.time == pytest.approx(stepped.time, rel=1e-3)
+        assert predicted.mass * speed == pytest.approx(stepped.normal_impulse, rel=1e-3)
+        impact = coulomb_impact(objective.oracle, q)
+        assert relative(speed * impact.jump, stepped.velocity) < 1e-3
+        assert impact.sticks == stepped.sticks
+        seen.add(stepped.sticks)
+    assert seen == {friction == 3.0}
+    G = objective.oracle.quantities(q).G
+    assert (predicted.mass * G == pytest.approx(1)) == (friction == 0.0)
+
+
+def test_the_force_of_the_first_example_grows() -> None:
+    """Without friction the force would fall by 23 %; with friction 0.7 the contact sticks, and the force grows."""
+    settings = validate(ProblemSettings, {"robot": "tilthex_arm", "frame": "ee", "normal": (0, 0, 1)}, "options")
+    prepared = prepare(settings)
+    solution = solve(prepared.problem, starts=4, compile="never")
+    objective, model = prepared.impact.objective, prepared.impact.robot.model
+    forces = []
+    for q in (solution.initial, solution.q):
+        J = frame_jacobian(model, q, prepared.impact.robot.frame_id("ee"))[:3]
+        forces.append(spring_impact(mass_matrix(model, q), J, np.array([0.0, 0, 1]), 0.7, 1e5, 1.0).force)
+    told = verdict(prepared.impact, *map(prepared.impact.evaluate, (solution.initial, solution.q)))
+    assert told.peak_force == pytest.approx(forces[1] / forces[0] - 1, abs=0.01)
+    assert forces[1] / forces[0] == pytest.approx(1.51, abs=0.02)
+    free = replace(objective.contact, friction=0.0)
+    masses = [
+        1 / WorstCaseObjective(objective.robot, free).oracle.quantities(q).G for q in (solution.initial, solution.q)
+    ]
+    assert np.sqrt(masses[1] / masses[0]) == pytest.approx(0.77, abs=0.02)
+
+
+@pytest.mark.parametrize("name", FRAMES)
+@pytest.mark.parametrize("friction", [0.0, 0.15, 3.0])
+@pytest.mark.parametrize("frame", ["world", "contact"])
+def test_gradients_of_mass_and_jumps_equal_differences(name: str, friction: float, frame: str) -> None:
+    plain = struck(name, friction)
+    objective = replace(plain, contact=replace(plain.contact, normal_frame=frame))
+    (q,) = random_configurations(objective.robot.model, 1, name, "slopes", friction)
+    bounds, numeric = ImpactBounds(objective, 1.0, 1.0), Numeric(objective.robot.model)
+    value, jacobian = bounds.evaluate(numeric.at(q))
+    assert value[0] == coulomb_impact(objective.oracle, q).mass
+    measured = central_gradient(lambda q: bounds.value(numeric.at(q)), objective.robot.model, q, 1e-4)
+    assert relative(jacobian, measured) < 1e-5
+    least = EffectiveMassObjective.of(objective)
+    assert relative(least.gradient(q), measured[0]) < 1e-5 and least.value(q) == value[0]
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.1, 0.7])
+def test_no_posture_exceeds_a_bound_on_the_simulated_force(friction: float) -> None:
+    """The program, the certificate and an integrated contact agree on the force, sticking and slipping."""
+    task = {"robot": "tilthex_arm", "normal": (0, 0, 1), "objective": "speed", "friction": friction}
+    task |= {"contact_stiffness": 1e5}
+    free = prepare(make_settings(task))
+    start = free.impact.evaluate().compression
+    assert start is not None and start.peak_force is not None
+    bounded = prepare(make_settings({**task, "max_force": 0.9 * start.peak_force}))
+    solution = solve(bounded.problem, starts=4, compile="never")
+    assert solution.certificate.holds()
+    model, impact = bounded.impact.robot.model, bounded.impact
+    J = frame_jacobian(model, solution.q, impact.robot.frame_id(impact.contact.frame), impact.contact.offset)[:3]
+    stepped = spring_impact(mass_matrix(model, solution.q), J, np.array([0.0, 0, 1]), friction, 1e5, 1.0)
+    assert stepped.force <= 0.9 * start.peak_force * 1.001
