@@ -40,6 +40,7 @@ def spring_impact(
     B = J @ W
     axes = np.linalg.svd(n[None, :])[2][1:].T
     Bt, coupling = axes.T @ B @ axes, axes.T @ B @ n
+    inverse = np.linalg.inv(Bt)
     step, damping = 1e-4 / np.sqrt(stiffness * (n @ B @ n)), 1 / np.linalg.norm(Bt, 2)
     if power != 1.0:
         depth = (speed**2 / (stiffness * (n @ B @ n))) ** (1 / (power + 1))
@@ -50,6 +51,9 @@ def spring_impact(
         middle = depth - n @ u * step / 2
         push = stiffness * middle**power * step
         slip = axes.T @ u + coupling * push
+        held = -inverse @ slip
+        if np.linalg.norm(held) <= friction * push:
+            friction_impulse = held
         for _ in range(10_000):
             tried = friction_impulse - damping * (slip + Bt @ friction_impulse)
             tried *= min(1.0, friction * push / max(np.linalg.norm(tried), 1e-300))

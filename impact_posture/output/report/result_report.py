@@ -81,7 +81,7 @@ def _track(prepared: Prepared, view: ResultView) -> Track:
 
 
 def _jumps(view: ResultView, postures: Array) -> tuple[Array, Array]:
-    """Return the jump at each posture, shape (n, nv), and the normal impulse of each contact, N·s, shape (n, contacts).
+    """Return the jump at each posture, shape (n, nv), and the normal impulses, N·s, shape (n, contacts).
 
     All contacts act at once if their common jump is defined, otherwise only the first contact.  If the impact is
     undefined, the jump is zero and the impulse is NaN.
