@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import resource
 import signal
@@ -30,13 +31,16 @@ def prepare() -> None:
 
 
 def finish(code: int) -> NoReturn:
-    """End the process with an exit code.
+    """Run the exit handlers and end the process with an exit code.  Signals are ignored from now on.
 
-    Signals are ignored from now on.  Otherwise, a signal would have its default effect while the interpreter ends.
+    The interpreter does not free its objects, because this takes 0.3 s for the expressions of a large robot.
     """
     for number in _WORDS:
         signal.signal(number, signal.SIG_IGN)
-    sys.exit(code)
+    atexit._run_exitfuncs()
+    with suppress(OSError, ValueError):
+        sys.stdout.flush()
+    os._exit(code)
 
 
 def memory_fault() -> str:
