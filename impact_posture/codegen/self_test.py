@@ -34,14 +34,16 @@ def casadi_reference(objective: WorstCaseObjective) -> Reference:
     depend on ``n``.  For several contacts, only ``objective`` and ``objective_grad`` exist.
     """
     k = objective.kernel
-    value, gradient = objective.gradient_fun().call([k.q, ca.DM(objective.contact.normal)])
+    value, gradient = objective.worst_case.expressions(k)
     outputs = {} if objective.others else {"H": k.H, "grad": k.grad_H}
     outputs |= {"objective": value, "objective_grad": gradient}
     outputs |= {} if objective.others else {"jump": k.jump.a, "G": k.G, "V": k.V, "ellipsoid": k.ellipsoid}
     function = ca.Function("reference", [k.q, k.n], [*outputs.values()], ["q", "n"], [*outputs])
 
     def evaluate(q: Array, n: Array) -> dict[str, Array]:
-        return {name: np.array(x, dtype=float).ravel() for name, x in zip(outputs, function(q, n), strict=True)}
+        along, stated = (function(q=q, n=normal) for normal in (n, objective.contact.normal))
+        results = {name: stated[name] if name.startswith("objective") else along[name] for name in outputs}
+        return {name: np.array(result, dtype=float).ravel() for name, result in results.items()}
 
     return evaluate
 
