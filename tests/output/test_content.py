@@ -404,11 +404,11 @@ def test_jump_bars_carry_the_jump(tilthex: ResultView, panda: ResultView) -> Non
     figure = jump_figure(tilthex)
     panels = np.array(figure.axes).reshape(3, 2)
     for column, factor in ((0, [1.0, 1.0]), (1, [0.6 / tilthex.before.G, 0.6 / tilthex.after.G])):
-        widths = [[bar.get_width() for bar in axes.patches] for axes in panels[:, column]]
-        # In each panel, the bars of the initial posture precede the bars of the optimum.
-        drawn = [[w for panel in widths for w in np.split(np.array(panel), 2)[k]] for k in (0, 1)]
-        for state, values, gain in zip((tilthex.before, tilthex.after), drawn, factor, strict=True):
-            np.testing.assert_allclose(values, gain * state.jump, rtol=1e-12)
+        # In each panel, a patch holds the bars of the initial posture, and another the bars of the optimum.
+        data = [[patch.get_data() for patch in axes.patches] for axes in panels[:, column]]
+        for state, bars, gain in zip((tilthex.before, tilthex.after), zip(*data, strict=True), factor, strict=True):
+            np.testing.assert_allclose(np.hstack([b.values[::2] for b in bars]), gain * state.jump, rtol=1e-12)
+            assert all(np.isnan(b.values[1::2]).all() and (np.diff(b.edges)[::2] > 0).all() for b in bars)
     assert [axes.get_xlabel() for axes in panels[:, 1]] == ["Δν  [m/s]", "Δν  [rad/s]", "Δν  [rad/s]"]
     units = tangent_units(panda.robot)
     assert [n for n, u in zip(panda.robot.tangent_names, units, strict=True) if u == "m/s"] == [

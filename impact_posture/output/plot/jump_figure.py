@@ -76,7 +76,9 @@ def groups_of(view: ResultView) -> list[tuple[str, list[int], str]]:
 def _bars(axes: Any, jumps: list[Array], points: list[Array | None]) -> None:
     rows = np.arange(len(jumps[0]))
     for shift, jump, point, bar in zip((-0.2, 0.2), jumps, points, (BEFORE_BAR, AFTER_BAR), strict=True):
-        axes.barh(rows + shift, jump, height=0.36, **bar)
+        # A single patch with gaps draws much faster than a patch for each bar.
+        edges = ((rows + shift)[:, None] + [-0.18, 0.18]).ravel()
+        axes.stairs(np.insert(jump, rows[1:], np.nan), edges, orientation="horizontal", fill=True, **bar)
         if point is not None:
             edge = VERMILLION if shift < 0 else INK
             look = {"color": "white", "markeredgecolor": edge, "markeredgewidth": 0.8}

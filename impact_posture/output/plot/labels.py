@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from matplotlib.text import Annotation
 from mpl_toolkits.mplot3d import proj3d
 from numpy.typing import NDArray
@@ -57,12 +56,11 @@ def draw_end_on(axes: Any, name: str, plane: Plane, n: Array, at: Array, color: 
     axes.add_artist(Label(name, at, (1.0, 1.0), color))
 
 
-def draw_with_labels(figure: Figure) -> FigureCanvasAgg:
-    """Draw a figure after its layout, with its letters where they cover no lines; return the image."""
-    labels = [(axes, text) for axes in figure.axes for text in axes.texts if isinstance(text, Label)]
+def draw_with_labels(canvas: FigureCanvasAgg) -> None:
+    """Draw the figure of a canvas after its layout, with its letters where they cover no lines."""
+    labels = [(axes, text) for axes in canvas.figure.axes for text in axes.texts if isinstance(text, Label)]
     for _, label in labels:
         label.set_visible(False)
-    canvas = FigureCanvasAgg(figure)
     canvas.draw()
     # The first row of the image is the top, but coordinates count from the bottom.
     image = np.asarray(canvas.buffer_rgba())[::-1] if labels else np.zeros((0, 0, 4), np.uint8)
@@ -72,7 +70,6 @@ def draw_with_labels(figure: Figure) -> FigureCanvasAgg:
         label.set_visible(True)
         _place(axes, label, ink)
         label.draw(canvas.get_renderer())
-    return canvas
 
 
 def _place(axes: Any, label: Label, ink: NDArray[np.bool_]) -> None:

@@ -224,8 +224,9 @@ def _fill(axes: Any, faces: list[Array], plane: Plane | None, color: str, zorder
 
 def draw_sticks(axes: Any, state: Skeleton, line: dict[str, Any], plane: Plane | None) -> None:
     """Draw sticks, shapes and marks of a robot, projected onto ``plane``, or in 3-D if ``plane`` is ``None``."""
-    for bone in state.bones:
-        _draw(axes, bone.T, plane, solid_capstyle="round", **line)
+    # A single line with gaps draws faster than a line for each stick.
+    sticks = np.insert(state.bones, 2, np.nan, axis=1).reshape(-1, 3)
+    _draw(axes, sticks.T, plane, solid_capstyle="round", **line)
     color, thin = line["color"], line | {"linewidth": 0.8, "zorder": 2.0}
     if state.hulls:
         draw_silhouettes(axes, state.hulls, color, plane)

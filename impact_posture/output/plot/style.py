@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import matplotlib
 import numpy as np
@@ -152,7 +152,8 @@ def shared_legend(body: Any, handles: Sequence[Any], place: str) -> None:
 
 def lay_out(figure: Figure) -> FigureCanvasAgg:
     """Lay out a figure once, so that it looks the same in every format; return its image."""
-    engine: Any = figure.get_layout_engine()
+    # Without a canvas, each round of the layout would create another image.
+    canvas, engine = FigureCanvasAgg(figure), cast(Any, figure.get_layout_engine())
     if engine is not None:
         # Panels with equal scales change their size in the first round.  The other rounds adjust their positions.
         equal = [axes for axes in figure.axes if axes.name == "3d" or axes.get_aspect() != "auto"]
@@ -170,7 +171,8 @@ def lay_out(figure: Figure) -> FigureCanvasAgg:
             box.p0, box.p1 = np.round(box.p0, 6), np.round(box.p1, 6)
         for axes in figure.axes:
             axes.set_position(np.round(axes.get_position(original=True).bounds, 6))
-    return draw_with_labels(figure)
+    draw_with_labels(canvas)
+    return canvas
 
 
 def _measure_once(axes: Any) -> None:
