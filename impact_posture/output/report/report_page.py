@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -14,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from impact_posture.errors import SpecError, printable
+from impact_posture.errors import printable
 from impact_posture.output.plot.result_view import number
 from impact_posture.output.report import REPORT
 from impact_posture.output.report.report_scene import ReportScene, Track, zipped
@@ -22,8 +21,6 @@ from impact_posture.system.output_folder import write_whole
 from impact_posture.version import __version__
 
 _VIEWER = Path(__file__).parent / "viewer"
-# Number of colors in a PNG figure.  Figures need few colors, and 64 colors make a file four times smaller.
-_COLORS = 64
 _TYPES = {".png": "image/png", ".svg": "image/svg+xml"}
 # Area of the curve in a chart, in units of the SVG view box.
 _LEFT, _RIGHT, _TOP, _BOTTOM = 60.0, 390.0, 8.0, 92.0
@@ -95,25 +92,10 @@ def figures(folder: Path) -> list[tuple[str, str]]:
     paths = (p for p in sorted(folder.rglob("*")) if p.suffix in _TYPES and p.is_file() and not p.is_symlink())
     # In the sorted list, an SVG file follows the PNG file with the same name and replaces it.
     by_name = {str(path.relative_to(folder).with_suffix("")): path for path in paths}
-    return [(name, _address(path)) for name, path in by_name.items()]
-
-
-def _address(path: Path) -> str:
-    content = path.read_bytes()
-    if path.suffix == ".png":
-        from PIL import Image
-
-        try:
-            # Allow only PNG, because Pillow may start a program such as Ghostscript for other formats.
-            with Image.open(path, formats=("PNG",)) as picture, io.BytesIO() as file:
-                picture.convert("RGB").quantize(_COLORS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(
-                    file, "PNG", compress_level=6
-                )
-                content = file.getvalue()
-        except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-            what = f"cannot be read as a picture ({error})"
-            raise SpecError(what, where=str(path), hint="remove it from the folder") from None
-    return f"data:{_TYPES[path.suffix]};base64,{base64.b64encode(content).decode('ascii')}"
+    return [
+        (name, f"data:{_TYPES[path.suffix]};base64,{base64.b64encode(path.read_bytes()).decode('ascii')}")
+        for name, path in by_name.items()
+    ]
 
 
 def _hash(text: str) -> str:
