@@ -18,7 +18,7 @@ _TIGHTEST = 3
 
 def announce(page: Page, prepared: Prepared) -> None:
     """Print the impact and the constraints, before the solver starts."""
-    if page.quiet:
+    if page.quiet or page.json:
         return
     impact, problem = prepared.impact, prepared.problem
     contacts = impact.objective.contacts

@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import re
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Any
 
 from impact_posture.errors import one_line, printable
+from impact_posture_cli.progress_line import progress
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -30,13 +32,24 @@ def complain(line: str) -> None:
 
 
 class Page:
-    """Writes titles, lines and tables to standard output, and warnings to standard error."""
+    """Writes titles, lines and tables to standard output, and warnings and progress to standard error.
 
-    def __init__(self, *, quiet: bool = False) -> None:
+    Attributes:
+        json: Standard output is one JSON document, so there is no progress line either.
+        quiet: There are no warnings, no progress line and no advice.
+    """
+
+    def __init__(self, *, json: bool = False, quiet: bool = False) -> None:
         from rich.console import Console
 
         self.console: Console = Console(highlight=False, soft_wrap=False)
-        self.quiet = quiet
+        self.json, self.quiet = json, quiet
+
+    def progress(
+        self, doing: str, unit: str = "", *, first: str = ""
+    ) -> AbstractContextManager[Callable[[int, int], None] | None]:
+        """Return the context :func:`.progress` of a progress line."""
+        return progress(doing, unit, shown=not (self.quiet or self.json), first=first)
 
     def title(self, text: str, detail: str = "") -> None:
         """Write a bold title, with a dim ``detail`` after it."""

@@ -14,7 +14,6 @@ from impact_posture.config.problem_settings import ImpactSettings, LoadOptions, 
 from impact_posture_cli import options
 from impact_posture_cli.error_boundary import UsageError
 from impact_posture_cli.output import Page, print_json
-from impact_posture_cli.progress_line import progress
 from impact_posture_cli.settings_options import TypedSettings, with_settings
 
 if TYPE_CHECKING:
@@ -56,7 +55,7 @@ def codegen(
             _check_problem(typed, robot)
     elif float_ or portable:
         raise UsageError("--controller always writes C99 with double: leave --float and --portable out.")
-    warnings: tuple[str, ...] = ()
+    page, warnings = Page(json=json, quiet=quiet), tuple[str, ...]()
     written: ControllerExport | Export
     place = Path(out) if out else None
     if controller is not None:
@@ -75,7 +74,7 @@ def codegen(
         from impact_posture.codegen.export import write_export
 
         objectives, optimum, squeezed, warnings = _objectives(typed, robot, from_result)
-        with progress("writing and compiling" if compile else "writing", shown=not (quiet or json)):
+        with page.progress("writing and compiling" if compile else "writing"):
             written = write_export(
                 objectives, place, prefix=prefix, posture=optimum, compression=squeezed, single=float_,
                 portable=portable, build=compile, force=force,
@@ -91,7 +90,6 @@ def codegen(
     if json:
         print_json(written.to_dict())
         return
-    page = Page(quiet=quiet)
     page.warnings(warnings)
     page.title(*title)
     page.pairs([("folder", str(written.out)), *rows])

@@ -10,8 +10,7 @@ import typer
 
 from impact_posture_cli import options
 from impact_posture_cli.experiments import RUN, Compile, Processes, ScenarioName, Seeds, rows_table
-from impact_posture_cli.output import Page, complain, print_json
-from impact_posture_cli.progress_line import progress
+from impact_posture_cli.output import Page, print_json
 
 Controllers = Annotated[
     str,
@@ -49,19 +48,18 @@ def compare(
     folder = None if out is None else Path(out)
     if folder is not None:
         check_output(folder, force=force, kind="comparison")
-    failure = ""
+    page, failure = Page(json=json, quiet=quiet), ""
     beside = nullcontext() if folder is None else store_beside(folder)
-    with beside as store, progress("running", "runs", shown=not (quiet or json)) as advance:
+    with beside as store, page.progress("running", "runs") as advance:
         reproduction = reproduce(plan, seeds=seeds, processes=jobs, store=store, progress=advance, compile=compile)
         if folder is not None and store is not None:
             output = Output(folder, force, format or FORMATS, not no_report, meshes)
             failure = write_comparison(output, reproduction, store)
-    if failure and not quiet:
-        complain(f"warning: there is no report.html: {failure}")
+    if failure:
+        page.warnings([f"there is no report.html: {failure}"])
     if json:
         print_json(reproduction.comparison())
         return
-    page = Page(quiet=quiet)
     statistic = "mean ± half of the 95 % interval" if seeds >= FEWEST else f"means (intervals from {FEWEST} seeds on)"
     if without_noise(metric for row in reproduction.rows for metric in row.metrics.values()):
         statistic = "all alike, because the scenario has no noise"

@@ -38,17 +38,16 @@ def inspect(
     from impact_posture.robot.robot_loader import load_robot
     from impact_posture.robot.robot_summary import summarize
 
-    load = typed.fill(RobotSettings, robot=robot)
+    page, load = Page(json=json, quiet=quiet), typed.fill(RobotSettings, robot=robot)
     if write_robot_toml is not None:
         if load.config is not None:
             raise UsageError("--config contradicts --write-robot-toml, which writes a new robot.toml: leave it out.")
-        _write(robot, load, write_robot_toml, force=force, json=json, quiet=quiet)
+        _write(page, robot, load, write_robot_toml, force=force)
         return
     summary = summarize(load_robot(robot, load))
     if json:
         print_json(summary)
         return
-    page = Page(quiet=quiet)
     _head(page, summary)
     _joints(page, summary)
     _frames(page, summary)
@@ -58,16 +57,15 @@ def inspect(
     page.warnings(summary["warnings"])
 
 
-def _write(robot: str, load: LoadOptions, out: str, *, force: bool, json: bool, quiet: bool) -> None:
+def _write(page: Page, robot: str, load: LoadOptions, out: str, *, force: bool) -> None:
     from impact_posture.robot.draft import write_draft
 
     path, draft = write_draft(robot, load, Path(out) if out else None, force=force)
-    if json:
+    if page.json:
         print_json({"file": str(path), "guesses": draft.guesses, "text": draft.text})
         return
-    page = Page(quiet=quiet)
     page.line(f"written: {path}")
-    if not quiet:
+    if not page.quiet:
         page.line("Check what was guessed:")
         page.table((), [("  -", line) for line in dict.fromkeys(draft.guesses)])
         page.line("Then optimize, without the options that this file answers:")

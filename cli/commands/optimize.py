@@ -13,7 +13,6 @@ from impact_posture.config.problem_settings import ProblemSettings
 from impact_posture_cli import options
 from impact_posture_cli.optimize_summary import announce, summarize
 from impact_posture_cli.output import Page, print_json
-from impact_posture_cli.progress_line import progress
 from impact_posture_cli.settings_options import TypedSettings, with_settings
 
 if TYPE_CHECKING:
@@ -59,14 +58,14 @@ def optimize(
         from impact_posture.path.posture_path import check_package
 
         check_package()
-    page, shown = Page(quiet=quiet or json), not (quiet or json)
+    page = Page(json=json, quiet=quiet)
     # For a large robot, fitting the collision shapes takes several seconds, unless they are in the cache.
-    with progress("preparing", "", shown=shown):
+    with page.progress("preparing"):
         prepared = prepare(settings)
     folder = Path(out) if out else default_out(prepared)
     check_output(folder, force=force, kind="result")
     announce(page, prepared)
-    with progress("solving", "starts", shown=shown, first="building the expressions") as advance:
+    with page.progress("solving", "starts", first="building the expressions") as advance:
         result = solve(
             PostureProblem.of(prepared),
             starts=settings.starts,
@@ -79,15 +78,15 @@ def optimize(
             finish_all=settings.finish_all or settings.path,
         )
     if settings.tradeoff:
-        with progress("solving", "points", shown=shown) as advance:
+        with page.progress("solving", "points") as advance:
             result = result.trade_off(settings.tradeoff, settings.tradeoff_against, compile=compile, progress=advance)
     if settings.path:
-        with progress("planning", "paths", shown=shown, first="searching a path to the optimum"):
+        with page.progress("planning", "paths", first="searching a path to the optimum"):
             result = result.path(seed=settings.seed)
     if not json:
         # Print the result first, because writing figures and C code takes longer.
         summarize(page, prepared, result.solution, result.document)
-    with progress("drawing" if no_codegen else "drawing and compiling", "files", shown=shown) as advance:
+    with page.progress("drawing" if no_codegen else "drawing and compiling", "files") as advance:
         written = result.save(
             folder,
             force=force,

@@ -9,7 +9,6 @@ import typer
 
 from impact_posture_cli import options
 from impact_posture_cli.output import Page, print_json
-from impact_posture_cli.progress_line import progress
 
 ResultFolder = Annotated[str, typer.Argument(metavar="RESULT_DIR", help="A folder that optimize wrote.")]
 Figures = Annotated[
@@ -40,13 +39,13 @@ def plot(
     folder = Path(result_dir)
     into = Path(out) if out else folder
     formats = format or FORMATS
-    with progress("drawing", shown=not (quiet or json)):
+    page = Page(json=json, quiet=quiet)
+    with page.progress("drawing"):
         written = draw_all(load_view(folder), into, formats, figure)
     # A result folder keeps a list of its files, which must include the new files.
     add_to_record(into, written)
     if json:
         print_json({"schema": "impact-posture/plot/1", "files": [str(path) for path in written]})
         return
-    page = Page(quiet=quiet)
     for path in written:
         page.line(str(path))

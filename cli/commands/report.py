@@ -11,8 +11,7 @@ import typer
 
 from impact_posture.errors import printable
 from impact_posture_cli import options
-from impact_posture_cli.output import print_json
-from impact_posture_cli.progress_line import progress
+from impact_posture_cli.output import Page, print_json
 
 OutputFolder = Annotated[
     str, typer.Argument(metavar="DIR", help="A folder that optimize, simulate or compare --out wrote.")
@@ -24,21 +23,21 @@ def report(
 ) -> None:
     from impact_posture.system.output_folder import add_to_record
 
-    place = Path(folder)
+    page, place = Page(json=json, quiet=quiet), Path(folder)
     rewrite: Callable[..., Path]
     if any(os.path.isfile(place / name) for name in ("run.json", "comparison.json")):
         from impact_posture.experiment.run_reports import write_run_report as rewrite
     else:
         from impact_posture.output.result_reader import rewrite_report as rewrite
-    with progress("writing", shown=not (quiet or json)):
+    with page.progress("writing"):
         written = rewrite(place, meshes=meshes)
     add_to_record(place, [written])
-    show_written("report", written, json=json, quiet=quiet)
+    show_written(page, "report", written)
 
 
-def show_written(command: str, page: Path, *, json: bool, quiet: bool) -> None:
-    """Print the path of a written page, as JSON or as text."""
-    if json:
-        print_json({"schema": f"impact-posture/{command}/1", "file": str(page)})
-    elif not quiet:
-        print(printable(str(page)))
+def show_written(page: Page, command: str, file: Path) -> None:
+    """Print the path of a written file, as JSON or as text."""
+    if page.json:
+        print_json({"schema": f"impact-posture/{command}/1", "file": str(file)})
+    elif not page.quiet:
+        print(printable(str(file)))

@@ -8,7 +8,6 @@ from typing import Annotated
 from impact_posture_cli import options
 from impact_posture_cli.experiments import RUN, Compile, Processes, Seeds, rows_table
 from impact_posture_cli.output import Page, print_json
-from impact_posture_cli.progress_line import progress
 
 All = Annotated[bool, options.option("--all", RUN, "Run every controller, not only the recommended ones.")]
 Scenarios = Annotated[
@@ -42,7 +41,8 @@ def reproduce(
             raise ScenarioNotFound(name, PAPER, hint="(others: simulate and compare)")
     folder = Path(out)
     check_output(folder, force=force, kind="reproduction")
-    with store_beside(folder) as store, progress("running", "runs", shown=not (quiet or json)) as advance:
+    page = Page(json=json, quiet=quiet)
+    with store_beside(folder) as store, page.progress("running", "runs") as advance:
         plan = {name: controllers_of(name, all_) for name in scenarios}
         reproduction = reproduce_all(
             plan, seeds=seeds, processes=jobs, store=store, progress=advance, compile=compile
@@ -51,7 +51,6 @@ def reproduce(
     if json:
         print_json(document)
         return
-    page = Page(quiet=quiet)
     for name in scenarios:
         paper = PAPER[name]
         page.title(name, f"the paper: {paper.nominal:g} to {paper.robust:g}, {100 * paper.reduction:.1f} % less")

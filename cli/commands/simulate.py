@@ -13,7 +13,6 @@ from impact_posture.errors import SimulationDiverged
 from impact_posture_cli import options
 from impact_posture_cli.experiments import RUN, Compile, Mode, ScenarioName
 from impact_posture_cli.output import Page, complain, number, print_json
-from impact_posture_cli.progress_line import progress
 from impact_posture_cli.settings_options import demanding
 
 if TYPE_CHECKING:
@@ -82,25 +81,26 @@ def simulate(
     from impact_posture.system.escape import file_name
     from impact_posture.system.output_folder import check_output
 
+    page = Page(json=json, quiet=quiet)
     if export_world is not None:
-        _export_world(Page(quiet=quiet or json), experiment, Path(export_world), force)
+        _export_world(page, experiment, Path(export_world), force)
         return
     check_gain(controller, gain)
     only, code = None if sign is None else int(sign), worth_compiling(compile, 1)
     job = Job(scenario, controller, seed, mode, free, gain, only, code)
     folder = Path(out) if out else Path(file_name(f"{experiment.name}-{job.label.replace(':', '-')}"))
     check_output(folder, force=force, kind="run")
-    with progress("running", shown=not (quiet or json)):
+    with page.progress("running"):
         with one_blas_thread():
             runs, document = execute(job)
         output = Output(folder, force, format or FORMATS, not no_report, meshes)
         failure = write_simulation(output, job, runs, document)
-    if failure and not quiet:
-        complain(f"warning: there is no report.html: {failure}")
+    if failure:
+        page.warnings([f"there is no report.html: {failure}"])
     if json:
         print_json(document)
     else:
-        _show(Page(quiet=quiet), document, job.label, folder)
+        _show(page, document, job.label, folder)
     if document["status"] != "completed":
         sys.stdout.flush()
         complain(f"error: {experiment.name}, {job.label}: {fate(document)}; its numbers are not a result")

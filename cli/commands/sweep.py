@@ -12,7 +12,6 @@ import typer
 from impact_posture_cli import options
 from impact_posture_cli.error_boundary import UsageError
 from impact_posture_cli.output import Page, number, print_json
-from impact_posture_cli.progress_line import progress
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -55,10 +54,11 @@ def sweep(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
+    page = Page(json=json, quiet=quiet)
     if target == "show":
         if folder is None:
             raise UsageError("Missing argument 'DIR': the folder that sweep wrote.")
-        _show(Path(folder), axes, out, format, json=json, quiet=quiet)
+        _show(page, Path(folder), axes, out, format)
         return
     if folder is not None:
         raise UsageError("DIR is only allowed after show: use --out for the folder of the sweep.")
@@ -75,7 +75,7 @@ def sweep(
     where = _executor(workers, scheduler, slurm, place, mpi=mpi)
     with (
         where as executor,
-        progress("solving", "points in all passes", shown=not (quiet or json), first="checking") as advance,
+        page.progress("solving", "points in all passes", first="checking") as advance,
     ):
         run = run_sweep(request, place, executor, progress=advance)
     document: dict[str, Any] = {
@@ -91,7 +91,6 @@ def sweep(
     if json:
         print_json(document)
         return
-    page = Page(quiet=quiet)
     solved = sum(run.counts.values())
     page.title(path.name, f"{run.points} problems, {solved} solved now")
     page.table(("status", "problems"), [(k, str(v)) for k, v in run.counts.items() if v], right=(1,))
@@ -117,19 +116,16 @@ def _executor(
     return executors.process_pool(workers) if workers > 1 else nullcontext()
 
 
-def _show(
-    folder: Path, axes: str | None, out: str | None, format: list[Any] | None, *, json: bool, quiet: bool
-) -> None:
+def _show(page: Page, folder: Path, axes: str | None, out: str | None, format: list[Any] | None) -> None:
     """Draw the maps of a sweep folder; print its best points and how often neighbors have different optima."""
     from impact_posture.sweep.maps import draw_maps
 
     wanted = tuple(name.strip() for name in axes.split(",")) if axes else None
-    with progress("drawing", shown=not (quiet or json)):
+    with page.progress("drawing"):
         shown = draw_maps(folder, Path(out) if out else folder / "maps", wanted, format or ("png",))
-    if json:
+    if page.json:
         print_json(shown.to_dict())
         return
-    page = Page(quiet=quiet)
     page.title(folder.name, f"{sum(shown.counts.values())} of {shown.points} problems solved")
     page.table(("status", "problems"), [(k, str(v)) for k, v in shown.counts.items() if v], right=(1,))
     page.line(f"{shown.switches} steps between neighbors switch to another optimum")

@@ -12,7 +12,6 @@ from impact_posture.config.problem_settings import ImpactSettings
 from impact_posture.config.setting import CONTACT, OUTPUT
 from impact_posture_cli import options
 from impact_posture_cli.output import Page, complain, print_json
-from impact_posture_cli.progress_line import progress
 from impact_posture_cli.settings_options import TypedSettings, demanding, with_settings
 
 if TYPE_CHECKING:
@@ -52,7 +51,8 @@ def verify(
 
     normal = {} if "contact" in typed.values else {"normal": typed.values.get("normal", (0.0, 0.0, 1.0))}
     impact = _of_result(Path(robot)) if from_result else resolve(typed.fill(ImpactSettings, robot=robot, **normal))
-    with progress("comparing", shown=not (quiet or json)) as advance:
+    page = Page(json=json, quiet=quiet)
+    with page.progress("comparing") as advance:
         report = verify_objective(impact.objective.singles[0], samples, seed, advance)
     if json:
         asked = {key: value for key, value in impact.to_dict().items() if key != "metric"}
@@ -60,7 +60,6 @@ def verify(
         document = {"schema": "impact-posture/verification/1", **asked, "metric": measure, **report.to_dict()}
         print_json(document | {"warnings": list(impact.warnings)})
     else:
-        page = Page(quiet=quiet)
         feet = f", standing on {len(impact.supports)}" if impact.supports else ""
         postures = "posture" if len(report.samples) == 1 else "postures"
         page.title(

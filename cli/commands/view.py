@@ -7,6 +7,7 @@ from pathlib import Path
 
 from impact_posture_cli import options
 from impact_posture_cli.commands.report import OutputFolder, show_written
+from impact_posture_cli.output import Page
 
 
 def view(folder: OutputFolder, json: options.Json = False, quiet: options.Quiet = False) -> None:
@@ -15,9 +16,9 @@ def view(folder: OutputFolder, json: options.Json = False, quiet: options.Quiet 
     from impact_posture.errors import InputError
     from impact_posture.output.report import REPORT
 
-    page = Path(folder) / REPORT
-    if not os.path.isfile(page):
-        raise InputError("is not there", where=str(page), hint=f"make it with `impact-posture report {folder}`")
-    if not webbrowser.open(page.resolve().as_uri()):
-        raise InputError("no browser could be started", where=str(page), hint="open this file in a browser")
-    show_written("view", page, json=json, quiet=quiet)
+    file = Path(folder) / REPORT
+    if not os.path.isfile(file):
+        raise InputError("is not there", where=str(file), hint=f"make it with `impact-posture report {folder}`")
+    if not webbrowser.open(file.resolve().as_uri()):
+        raise InputError("no browser could be started", where=str(file), hint="open this file in a browser")
+    show_written(Page(json=json, quiet=quiet), "view", file)
