@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from impact_posture.experiment.job_store import JobStore, Progress, run_batch
-from impact_posture.experiment.jobs import Document, Job, jsonable, parse_controller, worth_compiling
+from impact_posture.experiment.jobs import Document, Job, jsonable, parse_controller, software, worth_compiling
 from impact_posture.experiment.seed_statistics import ControllerRow, Interval, row_of
 from impact_posture.posture.program.compiled_solver import CompileMode
 from impact_posture.simulation.controllers.controller_factory import CONTROLLERS
@@ -166,7 +166,7 @@ class Reproduction:
     def comparison(self) -> dict[str, Any]:
         """Return the content of ``comparison.json``, for results of a single scenario."""
         head = {"schema": COMPARISON_SCHEMA, "scenario": self.rows[0].scenario, "seeds": list(range(self.seeds))}
-        return head | {"rows": jsonable(self.rows)}
+        return head | {"versions": software(), "rows": jsonable(self.rows)}
 
     def to_dict(self) -> dict[str, Any]:
         """Return the content of ``reproduction.json``."""
@@ -177,7 +177,7 @@ class Reproduction:
                 targets = {name: name not in missed for name in _TARGETS} | {"met": not missed}
             more = {"paper": PAPER.get(row.scenario), "targets": targets, "best": row is self.best(row.scenario)}
             rows.append(jsonable(row) | jsonable(more))
-        return {"schema": SCHEMA, "seeds": list(range(self.seeds)), "rows": rows}
+        return {"schema": SCHEMA, "seeds": list(range(self.seeds)), "versions": software(), "rows": rows}
 
 
 def reproduce(

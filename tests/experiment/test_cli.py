@@ -28,6 +28,12 @@ def document(*arguments: str, cwd: Path, prepare: Callable[[], None] | None = No
     return content
 
 
+def versions_of_runs(folder: Path) -> object:
+    first, *others = (json.loads(path.read_text())["versions"] for path in (folder / "runs").glob("*.json"))
+    assert "mujoco" in first and all(other == first for other in others)
+    return first
+
+
 def test_simulate(aerial: Path, tmp_path: Path) -> None:
     command = ("simulate", str(aerial), *"--controller robust --seed 3 --out run --format png".split())
     result = document(*command, cwd=tmp_path)
@@ -156,6 +162,7 @@ def test_compare(aerial: Path, tmp_path: Path) -> None:
     assert nominal["samples"] == 2 and nominal["half_width"] > 0
     assert result["rows"][1]["reduction"]["mean"] == pytest.approx(1 - robust["mean"] / nominal["mean"], abs=0.05)
     assert json.loads((tmp_path / "both" / "comparison.json").read_text()) == result
+    assert result["versions"] == versions_of_runs(tmp_path / "both")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["both"], "the store is removed"
     # The report shows both runs, read from the files of the folder.
     assert start("report", "both", "--quiet", cwd=tmp_path).returncode == 0
@@ -181,6 +188,7 @@ def test_reproduce(tmp_path: Path) -> None:
     text = (tmp_path / "all" / "SUMMARY.md").read_text()
     assert text == result["summary"] and "## What to choose" in text
     assert len(list((tmp_path / "all" / "runs").glob("*.json"))) == len(rows)
+    assert result["versions"] == versions_of_runs(tmp_path / "all")
     assert list((tmp_path / "all").rglob("*.png"))
 
 
