@@ -114,7 +114,10 @@ def _export_world(page: Page, scenario: Scenario, out: Path, force: bool) -> Non
 
     check_output(out, force=force, kind="world")
     export_world(set_up(scenario), out, force=force)
-    page.line(f"written: {out}; its sensors have no noise")
+    if page.json:
+        print_json({"schema": "impact-posture/world/1", "folder": str(out)})
+    else:
+        page.line(f"written: {out}; its sensors have no noise")
 
 
 def _rigid(prediction: dict[str, Any]) -> str:

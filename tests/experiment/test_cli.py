@@ -34,6 +34,12 @@ def versions_of_runs(folder: Path) -> object:
     return first
 
 
+def test_export_world(aerial: Path, tmp_path: Path) -> None:
+    result = document("simulate", str(aerial), "--export-world", "world", cwd=tmp_path)
+    assert result == {"schema": "impact-posture/world/1", "folder": "world"}
+    assert (tmp_path / "world" / "world.xml").is_file()
+
+
 def test_simulate(aerial: Path, tmp_path: Path) -> None:
     command = ("simulate", str(aerial), *"--controller robust --seed 3 --out run --format png".split())
     result = document(*command, cwd=tmp_path)
