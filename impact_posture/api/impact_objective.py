@@ -12,19 +12,29 @@ from numpy.typing import ArrayLike
 
 from impact_posture.config.checked import checked
 from impact_posture.config.demand import Factors, HalfAngle, NonNegative
-from impact_posture.config.problem_settings import RESTITUTION, SPEED, JointModel, MetricKind, ObjectiveKind
+from impact_posture.config.problem_settings import (
+    RESTITUTION,
+    SPEED,
+    ContactPoint,
+    JointModel,
+    MetricKind,
+    ObjectiveKind,
+)
 from impact_posture.errors import InputError
+from impact_posture.impact.contact_point import at_front
 from impact_posture.impact.evaluation.evaluation import Evaluation, evaluate
 from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.impact.metric import Metric, build_metric, check_weights
-from impact_posture.impact.resolved_impact import missing_support
+from impact_posture.impact.resolved_impact import held_by_default, missing_support
 from impact_posture.impact.support_compliance import check_compliance
 from impact_posture.impact.supports import refuse_held, refuse_rigid, resolve_supports
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.joint_model import with_joint_model
 from impact_posture.robot.model_variant import ModelVariant, Payload, build_model_variants
+from impact_posture.robot.posture_files import read_posture
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_spec import Support
+from impact_posture.system.arrays import Array
 
 # Only functions that use the C export import it, because the import takes longer than solving a small problem.
 if TYPE_CHECKING:
@@ -54,6 +64,8 @@ class ImpactObjective(WorstCaseObjective):
         weights: Weights of the weighted metric: nv numbers, a TOML file, or ``velocity-limits``.
         armature_range: Lowest and highest factor on the armature, for ``model_variants``.
         payloads: Payloads that the robot may carry, one at a time, for ``model_variants``: frame and mass in kg.
+        contact_point: ``front`` moves each contact point to the foremost point along −n of the links at the contact.
+        posture: Posture of this front: a name, a file or a configuration; ``None`` selects the default posture.
         joint_model: Model of the inertia at the joints: ``reflected``, ``link`` or ``locked``
             (:func:`~impact_posture.robot.joint_model.with_joint_model`); ``None`` selects the model of the robot.
 
@@ -77,6 +89,8 @@ class ImpactObjective(WorstCaseObjective):
         weights: str | Sequence[float] | None = None,
         armature_range: Factors | None = None,
         payloads: Sequence[tuple[str, float]] = (),
+        contact_point: ContactPoint = "frame",
+        posture: str | Array | Sequence[float] | None = None,
         joint_model: JointModel | None = None,
     ) -> None:
         robot = with_joint_model(robot, joint_model or robot.joint_model)
@@ -84,6 +98,12 @@ class ImpactObjective(WorstCaseObjective):
         if not contacts:
             raise InputError("names no contact", where="contact", hint="give an ImpactContact")
         leading, *more = (_with_offset(robot, each) for each in (*contacts, *others))
+        if contact_point == "front":
+            if posture is None or isinstance(posture, str):
+                q = read_posture(robot, posture)
+            else:
+                q = robot.check_posture(np.asarray(posture, dtype=float), where="posture")
+            leading, *more = (at_front(robot, each, q, held_by_default(robot)) for each in (leading, *more))
         feet = _supports(robot, supports)
         for each in (leading, *more):
             refuse_held(robot, each, feet)

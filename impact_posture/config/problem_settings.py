@@ -38,6 +38,7 @@ from impact_posture.config.text_parsers import parse_armature, parse_number_or_n
 
 Root = Literal["free-flyer", "fixed"]
 NormalFrame = Literal["world", "contact"]
+ContactPoint = Literal["frame", "front"]
 MetricKind = Literal["euclidean", "kinetic", "weighted"]
 ObjectiveKind = Literal["impulse", "speed", "sticking", "coulomb", "energy"]
 ObjectiveChoice = Literal[ObjectiveKind, "auto"]
@@ -125,6 +126,9 @@ class ImpactSettings(RobotSettings):
     )
     offset: Position | None = setting(None, "Contact point in the contact frame, m.", CONTACT, "X Y Z", "0 0 0")
     normal_frame: NormalFrame = setting("world", "Axes of the normal.", CONTACT)
+    contact_point: ContactPoint = setting(
+        "frame", "frame: the contact frame plus --offset; front: the foremost point towards the surface.", CONTACT
+    )
     contact: Contacts | None = setting(
         None, "Contact that replaces --frame and --normal; repeatable for up to 6 simultaneous contacts.", CONTACT,
         "FRAME:NX,NY,NZ[:IMPULSE]", repeatable=True,

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from impact_posture.config.problem_settings import ImpactSettings, ObjectiveKind, Vector3
 from impact_posture.config.text_parsers import parse_contact
 from impact_posture.errors import ContactError, FrameNotFound
+from impact_posture.impact.contact_point import EarlyTouch, at_front, early_touches
 from impact_posture.impact.elasticity.contact_compression import ContactStiffness
 from impact_posture.impact.evaluation.evaluation import Evaluation, evaluate
 from impact_posture.impact.impact_contact import ImpactContact, point_on
@@ -36,7 +39,16 @@ def resolve(settings: ImpactSettings, robot: Robot | None = None) -> ResolvedImp
     """
     robot = with_joint_model(load_robot(settings.robot, settings) if robot is None else robot, settings.joint_model)
     q = read_posture(robot, settings.posture)
+    hold = getattr(settings, "hold", None)
+    held = held_by_default(robot) if hold is None else tuple(hold)
     leading, *others = _contacts(settings, robot)
+    if settings.contact_point == "front":
+        if settings.offset is not None:
+            hint = "omit one of them"
+            raise ContactError("'front' contradicts `offset`", where="contact_point", hint=hint)
+        given = getattr(settings, "q", None)
+        at = q if given is None else robot.check_posture(np.array(given), where="q")
+        leading, *others = (at_front(robot, contact, at, held) for contact in (leading, *others))
     supports = resolve_supports(robot, settings.support)
     for contact in (leading, *others):
         refuse_held(robot, contact, supports)
@@ -60,7 +72,13 @@ def resolve(settings: ImpactSettings, robot: Robot | None = None) -> ResolvedImp
     stiffness = ContactStiffness.of(settings.contact_stiffness, settings.contact_duration)
     held_by = missing_support(robot) if settings.support is None and not supports else ""
     posture = settings.posture or robot.default_posture
-    return ResolvedImpact(objective, q, posture, settings.speed, settings.restitution, held_by, stiffness, choice)
+    speed, restitution = settings.speed, settings.restitution
+    return ResolvedImpact(objective, q, posture, speed, restitution, held_by, stiffness, choice, held)
+
+
+def held_by_default(robot: Robot) -> tuple[str, ...]:
+    """Return the joints that robot.toml holds at their values, without locked joints."""
+    return tuple(joint for joint in robot.spec.constraints.hold if joint not in robot.locked)
 
 
 def _choose(settings: ImpactSettings, *, several: bool) -> tuple[ObjectiveKind, str]:
@@ -122,6 +140,7 @@ class ResolvedImpact:
         missing_support: Hint how to give supports if the robot floats and no supports are given; otherwise empty.
         contact_stiffness: Elasticity of the contact; ``None`` if not known.
         choice: Reason why ``auto`` chose this objective; empty if the settings name the objective.
+        held: Joints that keep their values.
     """
 
     objective: WorstCaseObjective
@@ -132,6 +151,7 @@ class ResolvedImpact:
     missing_support: str = ""
     contact_stiffness: ContactStiffness | None = None
     choice: str = ""
+    held: tuple[str, ...] = ()
 
     @property
     def robot(self) -> Robot:
@@ -161,10 +181,20 @@ class ResolvedImpact:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Warnings about the robot and about this objective."""
-        warnings = (*self.robot.warnings, *self.objective.warnings)
+        # A single option `offset` cannot move several contact points.
+        alone = not self.objective.others
+        early = [
+            f"{touch.fact}: give {f'`offset` {touch.offset}, or ' if alone else ''}`contact_point` front"
+            for touch in self.early_touches(self.q)
+        ]
+        warnings = (*self.robot.warnings, *self.objective.warnings, *early)
         if not self.missing_support:
             return warnings
         return (*warnings, f"{self.robot.name} is assumed to be floating freely, {FLOATS}; {self.missing_support}")
+
+    def early_touches(self, q: Array) -> tuple[EarlyTouch, ...]:
+        """Return the links that touch the surface before their contact point does at ``q``, shape (nq,)."""
+        return early_touches(self.robot, self.objective.contacts, q, self.held)
 
     def to_dict(self, q: Array | None = None) -> dict[str, object]:
         """Return the blocks of ``result.json`` that describe the impact: robot, contacts, supports, metric.

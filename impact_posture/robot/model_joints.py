@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import pinocchio as pin
@@ -50,6 +51,15 @@ def joint_index(model: pin.Model, joint: str, where: str) -> int:
 def movable_joints(model: pin.Model) -> list[str]:
     """Return the names of all joints except the universe and the root joint."""
     return [str(name) for name in model.names if name not in ("universe", "root_joint")]
+
+
+def rigid_groups(model: pin.Model, held: Sequence[str]) -> list[int]:
+    """Return the group number of each joint; links of one group are one body if ``held`` do not move."""
+    group = list(range(model.njoints))
+    for joint in range(1, model.njoints):
+        if model.names[joint] in held:
+            group[joint] = group[int(model.parents[joint])]
+    return group
 
 
 def finite_armature(model: pin.Model) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:

@@ -32,6 +32,11 @@ def posture_warnings(
             f"the joints can bring the contact to the surface at no more than {attainable:.3g} m/s in the optimal "
             f"posture, not at {prepared.impact.speed:g} m/s: add `approach`, or correct the `speed`"
         )
+    if not prepared.impact.early_touches(initial):
+        held += [
+            f"in the optimal posture, {touch.fact}: give `offset` {touch.offset}, or `contact_pose` full"
+            for touch in prepared.impact.early_touches(q)
+        ]
     around = prepared.problem.surroundings
     if around is not None and around.shapes.bodies:
         return held

@@ -113,7 +113,7 @@ def verdict(impact: ResolvedImpact, before: Evaluation, after: Evaluation) -> Ve
         *_other_joint_model(impact, before, after),
     )
     sides = _predicted(before, pair[0]), _predicted(after, pair[1])
-    assumptions = _assumptions(impact, pair[1], together, force)
+    assumptions = _assumptions(impact, after, pair[1], together, force)
     return Verdict(outcome, line, jump, impulse, force, advice, *sides, assumptions)
 
 
@@ -126,7 +126,9 @@ def _predicted(evaluation: Evaluation, jump: Jump) -> PredictedImpact:
     )
 
 
-def _assumptions(impact: ResolvedImpact, jump: Jump, together: bool, force: float | None) -> tuple[str, ...]:
+def _assumptions(
+    impact: ResolvedImpact, after: Evaluation, jump: Jump, together: bool, force: float | None
+) -> tuple[str, ...]:
     friction = f"with friction {impact.contact.friction:g}" if isinstance(jump, CoulombJump) else "without friction"
     # Impacts at several contacts at the same time are treated as plastic.
     restitution = 0.0 if together else impact.restitution
@@ -135,6 +137,7 @@ def _assumptions(impact: ResolvedImpact, jump: Jump, together: bool, force: floa
         f"rigid impact at {impact.speed:g} m/s with restitution {restitution:g}, {friction}",
         f"jump in the {impact.objective.metric.kind} metric, with joint model '{impact.robot.joint_model}'",
         *(("the feet stay on the ground",) if impact.objective.supports else ()),
+        *(f"the impulse acts at the contact point, although {touch.fact}" for touch in impact.early_touches(after.q)),
         *((f"peak force of {stated}, {friction}",) if force is not None else ()),
     )
 

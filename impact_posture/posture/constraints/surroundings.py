@@ -22,6 +22,7 @@ from impact_posture.posture.constraints.clearance import Clearance
 from impact_posture.posture.constraints.nested_links import NestedLinks
 from impact_posture.posture.constraints.pair_distances import PairDistances
 from impact_posture.posture.constraints.separating_plane import ConvexBody, SeparatingPlane
+from impact_posture.robot.model_joints import rigid_groups
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_spec import Support
 from impact_posture.system.arrays import Array
@@ -53,7 +54,7 @@ class Surroundings:
         self.robot, self.shapes = robot, load_shapes(robot)
         self._clearance, self._numeric = clearance, numeric
         self._bodies = [ConvexBody.of_link(hull) for hull in self.shapes.bodies]
-        self._group = _rigid_groups(robot, held)
+        self._group = rigid_groups(robot.model, held)
         self._walls: list[_Wall] = []
         self._still = {0}
         self._depths: dict[ImpactContact, float] = {}
@@ -245,16 +246,6 @@ class Surroundings:
 
     def _height(self, body: ConvexBody, plane: ConvexBody) -> float:
         return SeparatingPlane(body, plane, 0.0).distance(self._numeric)[0]
-
-
-def _rigid_groups(robot: Robot, held: Sequence[str]) -> list[int]:
-    """Return the group number of each joint; links in the same group do not move relative to each other."""
-    fixed = {robot.joint_id(joint) for joint in held}
-    group = list(range(robot.model.njoints))
-    for joint in range(1, robot.model.njoints):
-        if joint in fixed:
-            group[joint] = group[int(robot.model.parents[joint])]
-    return group
 
 
 def _box_behind(n: Array, width: float) -> Array:

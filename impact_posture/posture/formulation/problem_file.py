@@ -13,14 +13,13 @@ from impact_posture.config.table_validation import read_toml, validate
 from impact_posture.errors import InputError, SpecError
 from impact_posture.impact.elasticity.contact_compression import ContactStiffness
 from impact_posture.impact.objective import Objective
-from impact_posture.impact.resolved_impact import FLOATS, ResolvedImpact, resolve
+from impact_posture.impact.resolved_impact import FLOATS, ResolvedImpact, held_by_default, resolve
 from impact_posture.posture.approach.attainable_speed import FASTEST
 from impact_posture.posture.constraints.center_of_mass_over_feet import CenterOfMassOverFeet
 from impact_posture.posture.constraints.requirements import Requirements
 from impact_posture.posture.formulation.build_problem import build_problem
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem
 from impact_posture.robot.model_variant import ModelVariant
-from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import from_folder, names_a_path
 from impact_posture.robot.urdf import EXAMPLE_PREFIX
 from impact_posture.system.escape import toml
@@ -78,16 +77,14 @@ def prepare(settings: ProblemSettings, impact: ResolvedImpact | None = None) -> 
             what = f"nothing says what holds {impact.robot.name} up, {FLOATS}"
             raise InputError(what, where=settings.robot, hint=impact.missing_support)
         impact = replace(impact, missing_support="")
-    problem = build_problem(impact.robot, impact.objective, impact.q, requirements(settings, impact.objective))
-    released = [joint for joint in _held_by_default(impact.robot) if joint not in problem.requirements.hold]
+    demands = requirements(settings, impact.objective)
+    impact = replace(impact, held=demands.hold)
+    problem = build_problem(impact.robot, impact.objective, impact.q, demands)
+    released = [joint for joint in held_by_default(impact.robot) if joint not in problem.requirements.hold]
     if released:
         note = f"robot.toml also holds {', '.join(released)}; your `hold` replaces its list, so these joints are free"
         problem = replace(problem, notes=(note, *problem.notes))
     return Prepared(settings, impact, problem)
-
-
-def _held_by_default(robot: Robot) -> tuple[str, ...]:
-    return tuple(joint for joint in robot.spec.constraints.hold if joint not in robot.locked)
 
 
 def requirements(settings: ProblemSettings, objective: Objective) -> Requirements:
@@ -118,7 +115,7 @@ def requirements(settings: ProblemSettings, objective: Objective) -> Requirement
         contact_pose=poses[0] if poses else "free",
         other_poses=tuple(poses[1:]),
         base=settings.base or base,
-        hold=_held_by_default(robot) if settings.hold is None else settings.hold,
+        hold=held_by_default(robot) if settings.hold is None else settings.hold,
         com_over_feet=com,
         com_asked=settings.com is not None,
         com_margin=spec.com_margin if settings.com_margin is None else settings.com_margin,
@@ -205,7 +202,7 @@ def _resolved_contacts(impact: ResolvedImpact) -> dict[str, object]:
     contact = impact.contact
     if not impact.objective.others:
         keys = ("frame", "normal", "offset", "friction", "impulse")
-        return {key: getattr(contact, key) for key in keys} | {"contact": None}
+        return {key: getattr(contact, key) for key in keys} | {"contact": None, "contact_point": "frame"}
     texts = tuple(f"{c.frame}:{','.join(map(repr, c.normal))}:{c.impulse!r}" for c in impact.objective.contacts)
     return {"frame": None, "normal": None, "offset": None, "contact": texts, "friction": contact.friction}
 

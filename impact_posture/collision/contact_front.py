@@ -1,0 +1,181 @@
+"""The foremost point of the links that move with a contact frame: the point that touches a surface first."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import coal
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.collision.coal_geometry import geometry_key, load_geometry
+from impact_posture.collision.shape_corners import shape_points
+from impact_posture.collision.swept_hull import hull_corners
+from impact_posture.collision.urdf_shapes import UrdfShape, read_urdf_shapes
+from impact_posture.config.cached_values import StoredArray, read_stored, write_stored
+from impact_posture.config.demand import Vector3
+from impact_posture.robot.model_joints import rigid_groups
+from impact_posture.robot.robot import Robot
+from impact_posture.system.arrays import Array
+
+# Points less than this (m) behind the foremost point belong to the same flat front.
+_FLAT = 5e-4
+# Corners of the polygon around a flat front.
+_SIDES = 64
+
+
+@dataclass(frozen=True)
+class ContactFront:
+    """The foremost point of the links that move with a contact frame, in a direction.
+
+    On a flat front, it is the point nearest to the line through the origin of the frame in this direction.
+
+    Attributes:
+        link: Link with the foremost point.
+        offset: The foremost point in the coordinates of the contact frame, shape (3,), m.
+        reach: Distance from the contact point to the foremost point along the direction, m.
+    """
+
+    link: str
+    offset: Vector3
+    reach: float
+
+
+@dataclass(frozen=True, eq=False)
+class Silhouette:
+    """A convex hull around a shape: corners, each with a ball and a disk around it.
+
+    Attributes:
+        link: Link of the shape.
+        corners: Corners in the axes of the joint that carries the link, shape (k, 3), m.
+        ball: Radius of the balls, m.
+        disk: Axis of the disks in the axes of the joint, its length is their radius, shape (3,), m.
+    """
+
+    link: str
+    joint: int
+    corners: StoredArray
+    ball: float
+    disk: StoredArray
+
+    def foremost(self, direction: Array) -> Array:
+        """Return points among which are the foremost ones along a unit direction, axes of the joint, shape (k, 3)."""
+        points = self.corners + self.ball * direction
+        radius = float(np.linalg.norm(self.disk))
+        if radius == 0:
+            return points
+        axis = self.disk / radius
+        ahead = direction - (direction @ axis) * axis
+        if np.linalg.norm(ahead) < 1e-9:
+            ahead = np.linalg.svd(axis[None])[2][1]
+        ahead = ahead / np.linalg.norm(ahead)
+        turns = np.arange(_SIDES) * 2 * np.pi / _SIDES
+        rim = radius * (np.outer(np.cos(turns), ahead) + np.outer(np.sin(turns), np.cross(axis, ahead)))
+        return np.asarray((points[:, None] + rim[None]).reshape(-1, 3))
+
+
+@dataclass(frozen=True, eq=False)
+class _Silhouettes:
+    shapes: tuple[Silhouette, ...]
+
+
+def contact_front(
+    robot: Robot, q: Array, frame: str, offset: Vector3, direction: Array, held: Sequence[str] = ()
+) -> ContactFront | None:
+    """Return the front of the links that do not move relative to a contact frame; ``None`` if they have no shapes.
+
+    These are the link of the frame, the links welded to it, and the links behind joints that do not move.  Their
+    shapes are the collision shapes, or the visual shapes of links without collision shapes.
+
+    Args:
+        robot: The robot with its shapes.
+        q: Posture, shape (nq,); it matters only for the joints that do not move.
+        frame: Contact frame.
+        offset: Contact point in the coordinates of the frame, shape (3,), m.
+        direction: Direction towards the surface, ``−n``, in the coordinates of the frame, shape (3,).
+        held: Joints that do not move.
+    """
+    carrier = robot.model.frames[robot.frame_id(frame)]
+    shapes = _shapes_near(robot, int(carrier.parentJoint), tuple(held))
+    if not shapes:
+        return None
+    data = robot.model.createData()
+    pin.forwardKinematics(robot.model, data, q)
+    to_frame = (data.oMi[carrier.parentJoint] * carrier.placement).inverse()
+    d = np.asarray(direction, dtype=float) / np.linalg.norm(direction)
+    points, owners = [], list[str]()
+    for shape in shapes:
+        at = to_frame * data.oMi[shape.joint]
+        points.append(shape.foremost(at.rotation.T @ d) @ at.rotation.T + at.translation)
+        owners += [shape.link] * len(points[-1])
+    corners = np.vstack(points)
+    heights = corners @ d
+    most = float(heights.max())
+    near = corners[heights > most - _FLAT]
+    x, y, z = (float(v) for v in _nearest(near - np.outer(near @ d, d), d) + most * d)
+    return ContactFront(owners[int(heights.argmax())], (x, y, z), most - float(np.dot(offset, d)))
+
+
+@lru_cache(maxsize=64)
+def _shapes_near(robot: Robot, joint: int, held: tuple[str, ...]) -> tuple[Silhouette, ...]:
+    """Return the shapes of the links that do not move relative to the link of a joint; meshes are cached on disk."""
+    described = read_urdf_shapes(robot)[0]
+    group = rigid_groups(robot.model, held)
+    near = [shape for shape in described if group[_joint(robot, shape.link)] == group[joint]]
+    if not near:
+        return ()
+    # Whether meshes with y up are turned depends on the shapes of all links.
+    needed = described if any(shape.y_up for shape in near) else near
+    key = geometry_key(robot, needed)
+    stored = read_stored("silhouettes", key, _Silhouettes)
+    if stored is None:
+        stored = _Silhouettes(_silhouettes(robot, needed))
+        write_stored("silhouettes", key, stored)
+    return tuple(shape for shape in stored.shapes if group[shape.joint] == group[joint])
+
+
+def _joint(robot: Robot, link: str) -> int:
+    return int(robot.model.frames[robot.model.getFrameId(link, pin.FrameType.BODY)].parentJoint)
+
+
+def _silhouettes(robot: Robot, described: list[UrdfShape]) -> tuple[Silhouette, ...]:
+    loaded, result = load_geometry(robot, described), []
+    for link, solid in zip(loaded.links, loaded.model.geometryObjects, strict=True):
+        shape, at = solid.geometry, solid.placement
+        ball, disk = 0.0, np.zeros(3)
+        match shape:
+            case coal.Sphere():
+                corners, ball = np.zeros((1, 3)), float(shape.radius)
+            case coal.Capsule():
+                corners, ball = _ends(shape.halfLength), float(shape.radius)
+            case coal.Cylinder():
+                corners, disk = _ends(shape.halfLength), shape.radius * at.rotation[:, 2]
+            case coal.Box():
+                corners = shape_points(shape)
+            case _:
+                corners = hull_corners(shape_points(shape))
+        placed = corners @ at.rotation.T + at.translation
+        result.append(Silhouette(link, int(solid.parentJoint), placed, ball, disk))
+    return tuple(result)
+
+
+def _ends(half_length: float) -> Array:
+    return np.array([[0.0, 0.0, half_length], [0.0, 0.0, -half_length]])
+
+
+def _nearest(flat: Array, axis: Array) -> Array:
+    """Return the point of the convex hull of points in a plane through zero that is nearest to zero, shape (3,)."""
+    across = np.linalg.svd(axis[None])[2][1:]
+    points = flat @ across.T
+    angles = np.arange(_SIDES) * 2 * np.pi / _SIDES
+    # The farthest points along turning directions are the corners of the hull in their order around it.
+    order = (points @ np.stack([np.cos(angles), np.sin(angles)])).argmax(axis=0)
+    start = points[order[np.flatnonzero(order != np.roll(order, 1))]] if np.ptp(order) else points[order[:1]]
+    edge = np.roll(start, -1, axis=0) - start
+    if len(start) > 2 and (edge[:, 1] * start[:, 0] - edge[:, 0] * start[:, 1] > 0).all():
+        return np.zeros(3)
+    along = -(start * edge).sum(axis=1) / np.maximum((edge**2).sum(axis=1), 1e-30)
+    nearest = start + np.clip(along, 0.0, 1.0)[:, None] * edge
+    return np.asarray(nearest[np.linalg.norm(nearest, axis=1).argmin()] @ across)
