@@ -40,6 +40,7 @@ def compare(
     if not labels:
         raise typer.BadParameter("name at least one controller", param_hint="--controllers")
     from impact_posture.experiment.experiment_folders import FORMATS, Output, store_beside, write_comparison
+    from impact_posture.experiment.jobs import controller_factory
     from impact_posture.experiment.reproduction import reproduce
     from impact_posture.experiment.seed_statistics import FEWEST, without_noise
     from impact_posture.system.output_folder import check_output
@@ -49,6 +50,9 @@ def compare(
     if folder is not None:
         check_output(folder, force=force, kind="comparison")
     page, failure = Page(json=json, quiet=quiet), ""
+    with page.progress("preparing"):
+        warnings = controller_factory(scenario).setup.warnings
+    page.warnings(warnings)
     beside = nullcontext() if folder is None else store_beside(folder)
     with beside as store, page.progress("running", "runs") as advance:
         reproduction = reproduce(plan, seeds=seeds, processes=jobs, store=store, progress=advance, compile=compile)

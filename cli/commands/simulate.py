@@ -74,7 +74,7 @@ def simulate(
     # Read the scenario before the slow imports, so that a wrong name is reported at once.
     experiment = read_scenario(scenario)
     from impact_posture.experiment.experiment_folders import FORMATS, Output, write_simulation
-    from impact_posture.experiment.jobs import Job, execute, worth_compiling
+    from impact_posture.experiment.jobs import Job, controller_factory, execute, worth_compiling
     from impact_posture.experiment.seed_statistics import fate
     from impact_posture.posture.program.ipopt import one_blas_thread
     from impact_posture.simulation.controllers.controller_factory import check_gain
@@ -90,9 +90,12 @@ def simulate(
     job = Job(scenario, controller, seed, mode, free, gain, only, code)
     folder = Path(out) if out else Path(file_name(f"{experiment.name}-{job.label.replace(':', '-')}"))
     check_output(folder, force=force, kind="run")
+    with page.progress("preparing"):
+        factory = controller_factory(job.scenario, job.free)
+    page.warnings(factory.setup.warnings)
     with page.progress("running"):
         with one_blas_thread():
-            runs, document = execute(job)
+            runs, document = execute(job, factory)
         output = Output(folder, force, format or FORMATS, not no_report, meshes)
         failure = write_simulation(output, job, runs, document)
     if failure:
@@ -100,7 +103,8 @@ def simulate(
     if json:
         print_json(document)
     else:
-        _show(page, document, job.label, folder)
+        # The first warnings are about the scenario, and were written before the run.
+        _show(page, document, job.label, folder, document["warnings"][len(factory.setup.warnings) :])
     if document["status"] != "completed":
         sys.stdout.flush()
         complain(f"error: {experiment.name}, {job.label}: {fate(document)}; its numbers are not a result")
@@ -131,7 +135,7 @@ def _rigid(prediction: dict[str, Any]) -> str:
     return ", ".join(f"{number(prediction[key], missing='–')} {words}" for key, words in named.items())
 
 
-def _show(page: Page, document: dict[str, Any], label: str, folder: Path) -> None:
+def _show(page: Page, document: dict[str, Any], label: str, folder: Path, notes: list[str]) -> None:
     page.title(f"{document['scenario']}, {label}", f"seed {document['seed']}")
     runs = document["runs"]
     rows = [("status", document["status"])]
@@ -161,7 +165,6 @@ def _show(page: Page, document: dict[str, Any], label: str, folder: Path) -> Non
             which = f" (push {event['sign']:+d})" if len(runs) > 1 else ""
             page.line(f"  t = {event['time']:.2f} s: {event['status']}{which}: {event['what']}")
     page.gap()
-    notes = list(document["warnings"])
     for key, note in (("offline", "note"), ("path", "reason")):
         if document[key] and document[key][note]:
             notes.append(document[key][note])

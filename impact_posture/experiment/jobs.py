@@ -137,7 +137,11 @@ def execute(job: Job, factory: ControllerFactory | None = None) -> tuple[tuple[R
         "runs": parts,
         "offline": None if offline is None else offline.to_dict(),
         "path": factory.path.to_dict() if job.controller.removesuffix("-stiff") == "path" else None,
-        "warnings": [*factory.warnings, *(links_behind(factory.setup, runs) if completed else ())],
+        "warnings": [
+            *factory.setup.warnings,
+            *factory.warnings,
+            *(links_behind(factory.setup, runs) if completed else ()),
+        ],
         "model_sha256": factory.setup.robot.model_sha256,
         "versions": software(),
     }

@@ -41,6 +41,15 @@ class Setup:
         """Distance between shape and surface at the start, m; InputError if the scenario has no contacts."""
         return self.world.built.gaps[self.scenario.surface.name, self.scenario.shape.frame]
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Warnings about the scenario that are known before a run."""
+        control = self.scenario.control
+        if not self.robot.floating or control.footing is not None or control.tilt is not None:
+            return ()
+        fault = f"no task keeps the base of {self.robot.name} level, so the robot may tilt until it falls"
+        return (f"{fault}: add [control.tilt] to the scenario",)
+
 
 def set_up(scenario: Scenario) -> Setup:
     """Load the robot, set its start posture, and build the world around it.

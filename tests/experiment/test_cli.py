@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from impact_posture.errors import InputError
+from impact_posture.experiment import jobs, reproduction
 from impact_posture.simulation import scenario_file
 from impact_posture.simulation.series import Series
 from impact_posture_cli.commands.simulate import _show
@@ -115,6 +117,28 @@ def test_simulate_a_robot_that_falls(falls: Path, tmp_path: Path) -> None:
     assert {"status", "time", "what", "sign"} == set(result["events"][0])
 
 
+def test_a_flying_robot_without_a_tilt_task_is_a_warning_before_the_run(aerial: Path, tmp_path: Path) -> None:
+    def stop() -> None:
+        def execute(*arguments: object, **options: object) -> None:
+            raise InputError("the run starts")
+
+        jobs.execute = reproduction.reproduce = execute
+
+    text, count = re.subn(r"(?m)^\[control.tilt\][^\[]*", "", aerial.read_text(encoding="utf-8"))
+    assert count == 1
+    (tmp_path / "tumbles.toml").write_text(text, encoding="utf-8")
+    for command in ("simulate", "compare"):
+        done = start(command, "tumbles.toml", cwd=tmp_path, prepare=stop)
+        warning, error = done.stderr.splitlines()
+        assert warning.startswith("warning: no task keeps the base of tilthex_arm level, so the robot may tilt")
+        assert error == "error: the run starts"
+        assert start(command, str(aerial), cwd=tmp_path, prepare=stop).stderr.splitlines() == [error]
+    done = start("simulate", "tumbles.toml", "--out", "run", cwd=tmp_path)
+    assert done.stderr.splitlines().count(warning) == 1
+    notes = json.loads((tmp_path / "run" / "run.json").read_text())["warnings"]
+    assert [f"warning: {note}" for note in notes[:1]] == [warning]
+
+
 def test_compare_robots_that_fall(falls: Path, tmp_path: Path) -> None:
     options = "--controllers nominal,stiff --seeds 1 --out both --format png --quiet --no-report".split()
     done = start("compare", str(falls), *options, cwd=tmp_path)
@@ -142,7 +166,7 @@ def test_simulate_prints_made_and_expected_contacts(capsys: pytest.CaptureFixtur
     result = {"scenario": "mine", "seed": 0, "status": "lost contact", "metrics": None, "events": [event],
               "windows": [{"kind": "dwell"}], "runs": [{"ticks": 900, "metrics": numbers}],
               "offline": None, "path": None, "warnings": []}  # fmt: skip
-    _show(Page(), result, "nominal", Path("there"))
+    _show(Page(), result, "nominal", Path("there"), [])
     text = " ".join(capsys.readouterr().out.split())
     assert "contacts 3 of 5" in text and "relaxed 7 of 900 ticks" in text and "held 2 ticks" in text
     assert "t = 1.25 s: lost contact: 2 of 5 contacts were never made" in text and "q_total" not in text
