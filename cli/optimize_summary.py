@@ -53,6 +53,7 @@ def summarize(page: Page, prepared: Prepared, solution: PostureSolution, documen
     initial, optimal = document["initial"], document["optimal"]
     impact, blocks = prepared.impact, {"before": initial, "after": optimal}
     page.line(document["verdict"]["line"], style="bold")
+    page.line(document["verdict"]["minimized"])
     for line in document["verdict"]["advice"]:
         page.line(f"  {line}")
     page.gap()
@@ -73,8 +74,6 @@ def summarize(page: Page, prepared: Prepared, solution: PostureSolution, documen
         page.line(document["robustness"]["line"])
     for note in solution.notes[len(prepared.problem.notes) :]:
         page.line(note)
-    if solution.moved > 1e-6:
-        page.line(f"the given posture did not satisfy the constraints: moved by {solution.moved:.3g} first")
     if document["active"]:
         page.line("active: " + ", ".join(dict.fromkeys(_active(a) for a in document["active"])))
     certificate = solution.certificate

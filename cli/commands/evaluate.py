@@ -149,7 +149,8 @@ def _slip(jump: CoulombJump) -> str:
 
 
 def _elastic(page: Page, impact: ResolvedImpact, response: ElasticResponse) -> None:
-    from impact_posture.impact.evaluation.velocity_jump import largest_entries, tangent_units
+    from impact_posture.impact.evaluation.impact_effect import tangent_units
+    from impact_posture.impact.evaluation.velocity_jump import largest_entries
 
     rows = [
         ("  ‖Δν‖ of the links at greatest compression", number(response.jump_norm), "jump"),

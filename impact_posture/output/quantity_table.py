@@ -36,25 +36,48 @@ def quantities(metric: Metric) -> list[tuple[str, str, str]]:
 
 
 def quantity_rows(impact: ResolvedImpact, initial: dict[str, Any], optimal: dict[str, Any]) -> list[QuantityRow]:
-    """Return the rows of the objective, H to E, normal impulse and peak force with friction, and approach speed.
+    """Return the rows of the table before and after.
 
-    Unknown quantities have no row.  ``initial`` and ``optimal`` are the blocks of ``result.json``.
+    First come what base, joints and contact feel at the stated speed and friction, then the fastest approach, the
+    norm of the jump, the objective, and H to E.  Unknown quantities have no row.  ``initial`` and ``optimal`` are the
+    blocks of ``result.json``.
     """
     named = quantities(impact.metric)
     kind, per_speed = impact.objective.kind, named[2][1]
     unit = {"impulse": "jump²", "energy": "kg"}.get(kind, per_speed)
     named.insert(0, ("objective", unit, f"what was minimized ({kind})"))
-    rows = [QuantityRow(key, initial[key], optimal[key], unit, words) for key, unit, words in named]
-    jumps = [block["jump"]["coulomb"] for block in (initial, optimal)]
-    forces = [(block["compression"] or {}).get("peak_force") for block in (initial, optimal)]
-    at, friction = f"at {impact.speed:g} m/s", f", friction {impact.contact.friction:g}"
-    if None not in jumps and impact.speed:
-        # Results of earlier versions do not have this number.
-        first, last = (jump.get("normal_impulse") for jump in jumps)
-        rows.append(QuantityRow("impulse", first, last, "N·s", f"normal impulse {at}{friction}"))
-    if None not in forces:
-        rows.append(QuantityRow("force", forces[0], forces[1], "N", f"peak normal force {at}{friction}"))
+    rows = _felt_rows(impact, initial, optimal) if impact.speed else []
     first, last = (block.get("attainable_speed") for block in (initial, optimal))
     if (first, last) != (None, None):
         rows.append(QuantityRow("approach", first, last, "m/s", "fastest within joint velocity limits"))
-    return rows
+    first, last = ((block["jump"]["coulomb"] or {}).get("norm") for block in (initial, optimal))
+    if impact.speed and None not in (first, last):
+        rows.append(QuantityRow("‖Δν‖", first, last, "jump", "base and joints in one norm"))
+    return [*rows, *(QuantityRow(key, initial[key], optimal[key], unit, words) for key, unit, words in named)]
+
+
+def _felt_rows(impact: ResolvedImpact, initial: dict[str, Any], optimal: dict[str, Any]) -> list[QuantityRow]:
+    """Return the rows of base, worst joint, normal impulse and peak force."""
+    at = f"at {impact.speed:g} m/s, friction {impact.contact.friction:g}"
+    rows, jumps = list[QuantityRow](), [block["jump"]["coulomb"] for block in (initial, optimal)]
+    # Results of earlier versions have neither effects nor normal impulses.
+    effects: list[dict[str, Any]] = [(jump or {}).get("effect") or {} for jump in jumps]
+    if all(effects):
+        pairs = [(f"base {key}", f"base_{key}", unit) for key, unit in (("linear", "m/s"), ("angular", "rad/s"))]
+        for name, key, unit in pairs:
+            rows += _row(name, [effect[key] for effect in effects], unit, f"jump of the base {at}")
+        joints = [effect["joint"] or {} for effect in effects]
+        names = " → ".join(dict.fromkeys(joint.get("name", "") for joint in joints))
+        velocities, unit = [joint.get("velocity") for joint in joints], joints[0].get("unit", "")
+        rows += _row("joint", velocities, unit, f"worst: {names}")
+        shares = [joint.get("share") for joint in joints]
+        percent = [None if share is None else 100 * share for share in shares]
+        rows += _row("joint share", percent, "%", "of its velocity limit")
+        rows += _row("impulse", [jump["normal_impulse"] for jump in jumps], "N·s", f"normal impulse {at}")
+    forces = [(block["compression"] or {}).get("peak_force") for block in (initial, optimal)]
+    return [*rows, *_row("force", forces, "N", f"peak normal force {at}")]
+
+
+def _row(key: str, values: list[Any], unit: str, meaning: str) -> list[QuantityRow]:
+    """Return the row of two values; no row if a value is unknown."""
+    return [] if None in values else [QuantityRow(key, values[0], values[1], unit, meaning)]

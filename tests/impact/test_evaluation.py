@@ -13,7 +13,7 @@ from impact_posture.config.text_parsers import parse_armature, parse_contact
 from impact_posture.errors import ContactError, FrameNotFound, InputError
 from impact_posture.impact.evaluation.ellipsoids import classical_ellipsoids, ellipsoid_of, force_ellipsoid
 from impact_posture.impact.evaluation.evaluation import Evaluation, evaluate
-from impact_posture.impact.evaluation.velocity_jump import tangent_units
+from impact_posture.impact.evaluation.impact_effect import tangent_units
 from impact_posture.impact.resolved_impact import resolve
 from impact_posture.impact.support_compliance import default_compliance
 from impact_posture.impact.worst_case_objective import WorstCaseObjective

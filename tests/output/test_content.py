@@ -17,7 +17,7 @@ from mpl_toolkits.mplot3d import proj3d
 
 from impact_posture.collision.robot_shapes import load_shapes
 from impact_posture.errors import InputError
-from impact_posture.impact.evaluation.velocity_jump import tangent_units
+from impact_posture.impact.evaluation.impact_effect import tangent_units
 from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.output.plot import FIGURES, ResultView, postures_figure
 from impact_posture.output.plot.classical_figure import classical_figure, kinds_of

@@ -144,8 +144,9 @@ def test_an_optimum_that_is_too_slow_moves_to_a_fast_one(name: str, speed: float
     assert slow < 0.9 * speed <= speed * (1 - 1e-6) <= fast
     assert solutions[1].optima[0].objective > solutions[0].optima[0].objective
     documents = [result_document(posed, one) for posed, one in zip((free, asked), solutions, strict=True)]
-    warned = [any("add `approach`" in line for line in document["warnings"]) for document in documents]
-    assert warned == [True, False]
+    verdicts = [document["verdict"] for document in documents]
+    assert [v["line"].startswith(f"verdict: cannot arrive at {speed:g} m/s (") for v in verdicts] == [True, False]
+    assert [v["outcome"] == "cannot arrive" for v in verdicts] == [True, False]
     assert fastest(asked, solutions[1].q) == pytest.approx(documents[1]["optimal"]["attainable_speed"], rel=1e-6)
 
 

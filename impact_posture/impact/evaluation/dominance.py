@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from impact_posture.config.json_block import json_block
-from impact_posture.impact.evaluation.velocity_jump import tangent_units
+from impact_posture.impact.evaluation.impact_effect import tangent_units
 from impact_posture.impact.quantities.impact_quantities import ImpactQuantities
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.model_joints import v_slice

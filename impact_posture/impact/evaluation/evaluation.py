@@ -25,6 +25,7 @@ from impact_posture.impact.elasticity.elastic_impact import ElasticImpact, Elast
 from impact_posture.impact.evaluation.coulomb_jump import CoulombJump, coulomb_jump, coulomb_jumps
 from impact_posture.impact.evaluation.dominance import Dominance, find_dominance
 from impact_posture.impact.evaluation.ellipsoids import Ellipsoid, ellipsoid_of
+from impact_posture.impact.evaluation.joint_yield import JointYield, joint_yield
 from impact_posture.impact.evaluation.objective_value import (
     VariantValue,
     objective_gradient,
@@ -74,6 +75,7 @@ class Evaluation:
         contact_mass: Effective mass along the normal with friction, kg; ``None`` if it is unbounded.
         compression: Compression time, peak force and the ratio x; ``None`` if all of them are unknown.
         elastic: Response of links, rotors and springs to the contact; ``None`` unless the joint model is ``elastic``.
+        joint_yield: How the joints move the contact along the normal; ``None`` if no joint moves it.
         dominance: Share of the joint that contributes most to H.
         without_supports: H, G, V, S, E of the robot without its supports; ``None`` for a robot without supports.
         compliance_effect: Relative change of H if the supports have a tenth of the compliance; ``None`` for a robot
@@ -105,6 +107,7 @@ class Evaluation:
     contact_mass: float | None
     compression: Compression | None
     elastic: ElasticResponse | None
+    joint_yield: JointYield | None
     dominance: Dominance
     without_supports: Scalars | None
     compliance_effect: float | None
@@ -131,7 +134,7 @@ class Evaluation:
             **{key: content[key] for key in ("gradient", "objective_gradient", "worst_normal", "ellipsoid")},
             "pose": {"position": self.pose.translation.tolist(), "quaternion_xyzw": quaternion.coeffs().tolist()},
             "jump": {key: content[key] for key in _JUMP},
-            **{key: content[key] for key in ("compression", "elastic", "dominance")},
+            **{key: content[key] for key in ("compression", "elastic", "joint_yield", "dominance")},
         }
         if self.cone is not None:
             block["cone"] = content["cone"]
@@ -202,6 +205,7 @@ def evaluate(
         contact_mass=contact_mass(oracle, q),
         compression=squeezed,
         elastic=_elastic(objective, q, speed, contact_stiffness),
+        joint_yield=joint_yield(objective, q),
         dominance=find_dominance(objective, quantities),
         without_supports=without_supports,
         compliance_effect=effect,

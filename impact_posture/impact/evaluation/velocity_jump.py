@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from impact_posture.config.json_block import json_block
-from impact_posture.dynamics.joints import joint_kind
+from impact_posture.impact.evaluation.impact_effect import ImpactEffect, impact_effect, tangent_units
 from impact_posture.impact.quantities.impact_quantities import ImpactQuantities
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.robot import Robot
@@ -23,6 +23,7 @@ class Jump:
         norm: Norm ``‖Δν‖_W``.
         impulse: Impulse of the surface on the robot, world axes, shape (3,), N·s.
         normal_impulse: Part of the impulse along the normal, N·s.
+        effect: What base and joints feel.
         largest: Largest entries of ``Δν`` as ``(name, value, unit)``, in descending order.
     """
 
@@ -30,6 +31,7 @@ class Jump:
     norm: float
     impulse: Array
     normal_impulse: float
+    effect: ImpactEffect
     largest: tuple[tuple[str, float, str], ...]
 
     @property
@@ -41,15 +43,6 @@ class Jump:
         """Return JSON content."""
         largest = [{"name": name, "value": value, "unit": unit} for name, value, unit in self.largest]
         return json_block(self) | {"largest": largest}
-
-
-def tangent_units(robot: Robot) -> tuple[str, ...]:
-    """Return ``m/s`` or ``rad/s`` for each of the nv velocity entries."""
-    units: list[str] = []
-    for index in range(1, robot.model.njoints):
-        subspace = joint_kind(robot.model.joints[index], str(robot.model.names[index])).subspace
-        units += ["m/s" if np.abs(column[:3]).max() > 0 else "rad/s" for column in subspace.T]
-    return tuple(units)
 
 
 def largest_entries(robot: Robot, values: Array) -> tuple[tuple[str, float, str], ...]:
@@ -111,4 +104,5 @@ def weighed_jump(objective: WorstCaseObjective, velocity: Array, impulse: Array)
     """
     norm = float(np.sqrt(max(float(velocity @ objective.oracle.weigh(velocity)), 0.0)))
     along = float(objective.oracle.n @ impulse)
-    return Jump(velocity, norm, impulse, along, largest_entries(objective.robot, velocity))
+    effect = impact_effect(objective.robot, velocity)
+    return Jump(velocity, norm, impulse, along, effect, largest_entries(objective.robot, velocity))

@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from impact_posture.impact.evaluation.coulomb_jump import CoulombJump, coulomb_jump
-from impact_posture.impact.evaluation.velocity_jump import tangent_units
+from impact_posture.impact.evaluation.impact_effect import tangent_units
 from impact_posture.output.plot.result_view import ResultView, header_lines, jump_unit, number
 from impact_posture.output.plot.style import AFTER_BAR, BEFORE_BAR, INK, VERMILLION, framed, shared_legend
 from impact_posture.system.arrays import Array

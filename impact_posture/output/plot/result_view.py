@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from impact_posture.config.problem_settings import RESTITUTION, SPEED, Against
 from impact_posture.errors import InputError, MetricError
+from impact_posture.impact.evaluation.impact_effect import tangent_units
 from impact_posture.impact.evaluation.objective_value import objective_value
-from impact_posture.impact.evaluation.velocity_jump import tangent_units
 from impact_posture.impact.impact_contact import point_on
 from impact_posture.impact.kinds.impact_kind import ImpactKind
 from impact_posture.impact.quantities.impact_oracle import ImpactOracle

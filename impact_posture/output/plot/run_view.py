@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impact_posture.errors import InputError
-from impact_posture.impact.evaluation.velocity_jump import tangent_units
+from impact_posture.impact.evaluation.impact_effect import tangent_units
 from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.output.plot.result_view import SEPARATOR, number
 from impact_posture.robot.robot import Robot

@@ -137,7 +137,12 @@ def _content(folder: Path, prepared: Prepared, view: ResultView, document: dict[
         title=title,
         command=typed_command(folder) or "impact-posture optimize problem.toml",
         facts=tuple(facts),
-        verdict=(document["verdict"]["line"], *document["verdict"]["advice"]),
+        verdict=(
+            document["verdict"]["line"],
+            # Results of earlier versions do not have this line.
+            *filter(None, [document["verdict"].get("minimized")]),
+            *document["verdict"]["advice"],
+        ),
         tables=(
             *_before_and_after(prepared, document),
             Table(

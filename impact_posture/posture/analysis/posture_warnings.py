@@ -1,4 +1,4 @@
-"""Warnings about an optimal posture that cannot be held, cannot be reached at speed, or crosses a surface."""
+"""Warnings about an optimal posture that cannot be held or crosses a surface."""
 
 from __future__ import annotations
 
@@ -8,30 +8,18 @@ from impact_posture.posture.formulation.problem_file import Prepared
 from impact_posture.posture.loads.holding_forces import HoldingForces
 from impact_posture.system.arrays import Array
 
-# If the attainable speed is below the approach speed by less than this share, there is no warning, because the
-# message shows only three digits of both speeds.
-_REACHED = 5e-3
 # Joints farther than this (m) behind a surface or below the ground are reported.
 _BEHIND = 0.01
 
 
-def posture_warnings(
-    prepared: Prepared, initial: Array, q: Array, holding: HoldingForces | None, attainable: float | None
-) -> list[str]:
-    """Return warnings about holding forces, approach speed, surface and ground for the optimal posture.
+def posture_warnings(prepared: Prepared, initial: Array, q: Array, holding: HoldingForces | None) -> list[str]:
+    """Return warnings about holding forces, surface and ground for the optimal posture.
 
-    ``holding`` are the forces that hold the optimal posture, and ``attainable`` is the highest contact speed that the
-    joints can reach in this posture, m/s.  ``holding`` or ``attainable`` is ``None`` if unknown.
+    ``holding`` are the forces that hold the optimal posture; ``None`` if unknown.
     """
     verb = "hold" if prepared.impact.robot.spec.propulsion is None else "hover in"
     loads = holding.violations() if holding else []
     held = [f"the robot cannot {verb} the optimal posture: {violation}" for violation in loads]
-    demanded = prepared.problem.requirements.approach_speed > 0
-    if attainable is not None and attainable < (1 - _REACHED) * prepared.impact.speed and not demanded:
-        held.append(
-            f"the joints can bring the contact to the surface at no more than {attainable:.3g} m/s in the optimal "
-            f"posture, not at {prepared.impact.speed:g} m/s: add `approach`, or correct the `speed`"
-        )
     if not prepared.impact.early_touches(initial):
         held += [
             f"in the optimal posture, {touch.fact}: give `offset` {touch.offset}, or `contact_pose` full"

@@ -17,6 +17,7 @@ from impact_posture.posture.analysis.posture_warnings import posture_warnings
 from impact_posture.posture.analysis.robustness import Robustness
 from impact_posture.posture.analysis.trade_off import TradeOff
 from impact_posture.posture.analysis.verdict import verdict
+from impact_posture.posture.analysis.verdict_conditions import Circumstances
 from impact_posture.posture.approach.attainable_speed import AttainableSpeed
 from impact_posture.posture.formulation.problem_file import Prepared
 from impact_posture.posture.loads.load_cases import load_cases
@@ -50,12 +51,12 @@ def result_document(
     approach = AttainableSpeed(impact.robot, impact.objective, prepared.problem.requirements)
     attainable = [approach.reached(q) for q in (solution.initial, solution.q)]
     fault = [solution.compiler_fault] if solution.compiler_fault else []
-    at_posture = posture_warnings(prepared, solution.initial, solution.q, after, attainable[1])
+    at_posture = posture_warnings(prepared, solution.initial, solution.q, after)
     warnings = (*impact.warnings, *initial.warnings, *optimal.warnings, *fault, *at_posture)
     curve = {} if tradeoff is None else {"tradeoff": tradeoff.to_list(), "tradeoff_against": tradeoff.against}
     return {
         "schema": SCHEMA,
-        "verdict": verdict(impact, initial, optimal).to_dict(),
+        "verdict": verdict(impact, initial, optimal, Circumstances(attainable[1], solution.moved)).to_dict(),
         **impact.to_dict(solution.initial),
         "constraints": prepared.problem.describe(),
         "initial": {

@@ -1,11 +1,10 @@
-"""The verdict on an optimal posture: how jump, impulse and force change at the given approach speed."""
+"""The verdict on an optimal posture: what base, joints and contact feel at the given speed and friction."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 from math import sqrt
-from typing import Literal
 
 from impact_posture.config.json_block import json_block
 from impact_posture.impact.elasticity.contact_compression import both_models
@@ -13,34 +12,15 @@ from impact_posture.impact.evaluation.coulomb_jump import CoulombJump, coulomb_j
 from impact_posture.impact.evaluation.evaluation import Evaluation
 from impact_posture.impact.evaluation.velocity_jump import Jump
 from impact_posture.impact.resolved_impact import ResolvedImpact
-
-Outcome = Literal[
-    "better", "better at the price of force", "better at the price of impulse", "no better", "worse", "unknown"
-]
-
-# A relative change below this value is treated as no change.
-_SAME = 0.01
-
-
-@dataclass(frozen=True)
-class PredictedImpact:
-    """The predicted impact in one posture at the given approach speed; ``jump`` is ``‖Δν‖_W``.
-
-    Attributes:
-        impulse: Normal impulse at the first contact, N·s.
-        peak_force: Largest normal force with the friction of the contact, N; ``None`` if no contact stiffness is
-            given, or for several contacts.
-        sticks: Whether the first contact point sticks; ``None`` if the jump was computed without friction.
-    """
-
-    jump: float
-    impulse: float
-    peak_force: float | None
-    sticks: bool | None
-
-    def to_dict(self) -> dict[str, object]:
-        """Return JSON content."""
-        return json_block(self)
+from impact_posture.posture.analysis.verdict_changes import (
+    SAME,
+    PredictedImpact,
+    changes,
+    in_words,
+    outcome_of,
+    relative_change,
+)
+from impact_posture.posture.analysis.verdict_conditions import Circumstances, Condition, conditions
 
 
 @dataclass(frozen=True)
@@ -48,22 +28,27 @@ class Verdict:
     """Changes from the initial to the optimal posture, at the given approach speed and friction.
 
     Attributes:
-        outcome: Verdict in a few words, one of the values of ``Outcome``.
-        line: One sentence that describes the verdict.
+        outcome: Verdict in a few words: ``better`` (nothing that base, joints or contact feel grows by 5 % or more),
+            ``better for … at the price of …``, ``no better``, ``worse``, ``cannot arrive`` or ``unknown``.
+        line: The conditions, the outcome and the numbers in words.
+        minimized: What was minimized, and the change of the norm of the jump, in words.
         jump: Relative change of ``‖Δν‖_W``; ``None`` if it is unknown.
         impulse: Relative change of the normal impulse.
         peak_force: Relative change of the peak force with friction; ``None`` if it is unknown.
         advice: Advice, one line each: the jump without friction, a better objective, or a more accurate joint model.
+        conditions: Conditions under which the numbers hold, the gravest first.
         before, after: The predicted impact in the initial and in the optimal posture; ``None`` if it is unknown.
         assumptions: Assumptions behind the numbers, one line each.
     """
 
-    outcome: Outcome
+    outcome: str
     line: str
-    jump: float | None
-    impulse: float | None
-    peak_force: float | None
-    advice: tuple[str, ...]
+    minimized: str = ""
+    jump: float | None = None
+    impulse: float | None = None
+    peak_force: float | None = None
+    advice: tuple[str, ...] = ()
+    conditions: tuple[Condition, ...] = ()
     before: PredictedImpact | None = None
     after: PredictedImpact | None = None
     assumptions: tuple[str, ...] = ()
@@ -73,8 +58,10 @@ class Verdict:
         return json_block(self)
 
 
-def verdict(impact: ResolvedImpact, before: Evaluation, after: Evaluation) -> Verdict:
-    """Compare the predicted jumps of the initial and the optimal posture.
+def verdict(
+    impact: ResolvedImpact, before: Evaluation, after: Evaluation, known: Circumstances = Circumstances()
+) -> Verdict:
+    """Compare the predicted impacts in the initial and the optimal posture.
 
     Jumps, impulses and forces include the friction of the contact.  Peak forces are for the given contact stiffness,
     or for a linear contact of any stiffness, ``F ∝ √m`` with the effective mass m with friction.  Several contacts
@@ -82,53 +69,78 @@ def verdict(impact: ResolvedImpact, before: Evaluation, after: Evaluation) -> Ve
     is compared.
     """
     together = bool(before.together and after.together)
-    pair = _jump(before, together), _jump(after, together)
-    if impact.speed <= 0 or pair[0] is None or pair[1] is None:
+    first, last = _jump(before, together), _jump(after, together)
+    stated = conditions(impact, before, after, known)
+    opening = "; ".join(condition.line for condition in stated)
+    if impact.speed <= 0 or first is None or last is None:
         why = "there is no approach speed" if impact.speed <= 0 else "the contact cannot move along the normal"
-        return Verdict("unknown", f"no verdict: {why}.", None, None, None, ())
-    jump, impulse = _change(pair[0].norm, pair[1].norm), _change(pair[0].normal_impulse, pair[1].normal_impulse)
-    force = _force_change(before, after)
-    outcome: Outcome = "better at the price of impulse" if impulse > _SAME else "better"
-    if (force or 0.0) > _SAME:
-        outcome = "better at the price of force"
-    if jump > _SAME:
-        outcome = "worse"
-    elif jump > -_SAME:
-        outcome = "no better"
-    where = f" at {impact.contact.frame}" if together else ""
-    parts = [
-        f"the jump {_in_words(jump)} ({pair[0].norm:.3g} to {pair[1].norm:.3g}{_slip(pair[1])})",
-        f"the normal impulse{where} {_in_words(impulse)} "
-        f"({pair[0].normal_impulse:.3g} to {pair[1].normal_impulse:.3g} N·s)",
-    ]
-    if force is not None:
-        parts.append(f"the peak force {_in_words(force)}{_newtons(before, after)}")
-    contact = f"with friction {impact.contact.friction:g}" if isinstance(pair[1], CoulombJump) else "without friction"
+        line = "; ".join(filter(None, [opening, f"no verdict, because {why}"]))
+        return Verdict("unknown", f"verdict: {line}.", conditions=stated)
+    sides, force = (_predicted(before, first), _predicted(after, last)), _force_change(before, after)
+    felt = changes(*sides, impact.speed, force, f" at {impact.contact.frame}" if together else "")
+    outcome = outcome_of(felt)
+    contact = f"with friction {impact.contact.friction:g}" if isinstance(last, CoulombJump) else "without friction"
+    contact += _slip(last)
     if impact.objective.others:
-        contact += ", all contacts at once," if together else f", at {impact.contact.frame} alone,"
-    line = f"verdict: {outcome}. At {impact.speed:g} m/s {contact} {', '.join(parts[:-1])} and {parts[-1]}."
+        contact += ", all contacts at once" if together else f", at {impact.contact.frame} alone"
+    numbers = [change.line for change in felt]
+    told = f"At {impact.speed:g} m/s {contact}: {', '.join(numbers)}."
+    refuted = any(condition.refutes for condition in stated)
+    opening += ". " if opening else ""
+    told = f"verdict: {opening}{_sentence(outcome, refuted, bool(opening))}. {told}"
+    jump = relative_change(first.norm, last.norm)
     advice = (
+        *(condition.hint for condition in stated if condition.hint),
         *_without_friction(before, after, jump),
-        *_better_objective(impact, outcome, (pair[0], pair[1])),
+        *_better_objective(impact, outcome, (first, last)),
+        *(("`max_force` bounds the force",) if any(c.grows for c in felt if c.side == "force") else ()),
         *_other_joint_model(impact, before, after),
     )
-    sides = _predicted(before, pair[0]), _predicted(after, pair[1])
-    assumptions = _assumptions(impact, after, pair[1], together, force)
-    return Verdict(outcome, line, jump, impulse, force, advice, *sides, assumptions)
+    return Verdict(
+        outcome="cannot arrive" if refuted else outcome,
+        line=told,
+        minimized=_minimized(impact, (first, last)),
+        jump=jump,
+        impulse=relative_change(first.normal_impulse, last.normal_impulse),
+        peak_force=force,
+        advice=advice,
+        conditions=stated,
+        before=sides[0],
+        after=sides[1],
+        assumptions=_assumptions(impact, last, together, force),
+    )
+
+
+def _sentence(outcome: str, refuted: bool, later: bool) -> str:
+    """Return the outcome as the start of a sentence; ``later`` if other sentences come before it."""
+    if refuted:
+        return f"If it arrived, it would be {outcome}"
+    return outcome.capitalize() if later else outcome
 
 
 def _predicted(evaluation: Evaluation, jump: Jump) -> PredictedImpact:
     # If several contacts are struck at the same time, their forces are unknown.
     compression = None if evaluation.contacts else evaluation.compression
-    peak = None if compression is None else compression.peak_force
     return PredictedImpact(
-        jump.norm, jump.normal_impulse, peak, jump.sticks if isinstance(jump, CoulombJump) else None
+        base_linear=jump.effect.base_linear,
+        base_angular=jump.effect.base_angular,
+        joint=jump.effect.joint,
+        impulse=jump.normal_impulse,
+        peak_force=None if compression is None else compression.peak_force,
+        jump=jump.norm,
+        sticks=jump.sticks if isinstance(jump, CoulombJump) else None,
     )
 
 
-def _assumptions(
-    impact: ResolvedImpact, after: Evaluation, jump: Jump, together: bool, force: float | None
-) -> tuple[str, ...]:
+def _minimized(impact: ResolvedImpact, jumps: tuple[Jump, Jump]) -> str:
+    metric = impact.objective.metric.kind
+    mixed = "" if metric == "kinetic" else ", m/s and rad/s in one norm,"
+    change = in_words(relative_change(jumps[0].norm, jumps[1].norm))
+    norm = f"‖Δν‖ ({metric}{mixed.rstrip(',')}) {change} ({jumps[0].norm:.3g} to {jumps[1].norm:.3g})"
+    return f"minimized: {impact.objective.kind}; the whole jump {norm}"
+
+
+def _assumptions(impact: ResolvedImpact, jump: Jump, together: bool, force: float | None) -> tuple[str, ...]:
     friction = f"with friction {impact.contact.friction:g}" if isinstance(jump, CoulombJump) else "without friction"
     # Impacts at several contacts at the same time are treated as plastic.
     restitution = 0.0 if together else impact.restitution
@@ -137,7 +149,6 @@ def _assumptions(
         f"rigid impact at {impact.speed:g} m/s with restitution {restitution:g}, {friction}",
         f"jump in the {impact.objective.metric.kind} metric, with joint model '{impact.robot.joint_model}'",
         *(("the feet stay on the ground",) if impact.objective.supports else ()),
-        *(f"the impulse acts at the contact point, although {touch.fact}" for touch in impact.early_touches(after.q)),
         *((f"peak force of {stated}, {friction}",) if force is not None else ()),
     )
 
@@ -146,17 +157,6 @@ def _jump(evaluation: Evaluation, together: bool) -> Jump | None:
     if evaluation.together and together:
         return evaluation.together[0]
     return evaluation.coulomb or evaluation.frictionless
-
-
-def _change(before: float, after: float) -> float:
-    return after / before - 1 if before > 0 else 0.0
-
-
-def _in_words(change: float) -> str:
-    if abs(change) <= _SAME:
-        return "stays"
-    size = f"{100 * abs(change):.0f} %" if change < 1 else f"a factor of {1 + change:.3g}"
-    return f"{'falls' if change < 0 else 'grows'} by {size}"
 
 
 def _slip(jump: Jump) -> str:
@@ -168,29 +168,23 @@ def _force_change(before: Evaluation, after: Evaluation) -> float | None:
         return None
     first, second = before.compression, after.compression
     if first and second and first.peak_force is not None and second.peak_force is not None:
-        return _change(first.peak_force, second.peak_force)
+        return relative_change(first.peak_force, second.peak_force)
     return sqrt(after.contact_mass / before.contact_mass) - 1
-
-
-def _newtons(before: Evaluation, after: Evaluation) -> str:
-    first, second = before.compression, after.compression
-    if not (first and second) or first.peak_force is None or second.peak_force is None:
-        return " (linear contact)"
-    return f" ({first.peak_force:.3g} to {second.peak_force:.3g} N)"
 
 
 def _without_friction(before: Evaluation, after: Evaluation, jump: float) -> Iterator[str]:
     """Yield the change of the jump without friction if its sign differs from the change with friction."""
     if before.frictionless is None or after.frictionless is None or before.contacts:
         return
-    change = _change(before.frictionless.norm, after.frictionless.norm)
-    if abs(change) > _SAME and (change > 0) != (jump > 0):
-        yield f"without friction the jump {_in_words(change)}"
+    change = relative_change(before.frictionless.norm, after.frictionless.norm)
+    if abs(change) >= SAME and (change > 0) != (jump > 0):
+        yield f"without friction the jump {in_words(change)}"
 
 
-def _better_objective(impact: ResolvedImpact, outcome: Outcome, jumps: tuple[Jump, Jump]) -> Iterator[str]:
+def _better_objective(impact: ResolvedImpact, outcome: str, jumps: tuple[Jump, Jump]) -> Iterator[str]:
     objective = impact.objective
-    if outcome in ("worse", "no better") and objective.kind != "coulomb" and not objective.others:
+    grown = relative_change(jumps[0].norm, jumps[1].norm) > -SAME
+    if (grown or outcome in ("worse", "no better")) and objective.kind != "coulomb" and not objective.others:
         kind = "sticking" if objective.normal_cone_deg else "coulomb"
         # If the contact sticks at both postures, the jump with friction is the jump that S measures.  At friction 0,
         # the jump equals the jump that V measures.  If the objective is already S or V in these cases, another
@@ -199,9 +193,7 @@ def _better_objective(impact: ResolvedImpact, outcome: Outcome, jumps: tuple[Jum
         sticks = all(isinstance(jump, CoulombJump) and jump.sticks for jump in jumps)
         same = (kind, "speed" if slides else "", "sticking" if sticks else "")
         if objective.kind not in same and not (slides and kind == "sticking"):
-            yield f"`objective` {kind} minimizes this jump; '{objective.kind}' minimizes another quantity"
-    if outcome == "better at the price of force":
-        yield "`max_force` bounds the force"
+            yield f"`objective` {kind} minimizes this whole jump; '{objective.kind}' minimizes another quantity"
 
 
 def _other_joint_model(impact: ResolvedImpact, before: Evaluation, after: Evaluation) -> Iterator[str]:
@@ -215,5 +207,5 @@ def _other_joint_model(impact: ResolvedImpact, before: Evaluation, after: Evalua
             continue
         jumps = [coulomb_jump(objective, evaluation.q, rebound) for evaluation in (before, after)]
         if jumps[0] is not None and jumps[1] is not None:
-            change = _in_words(_change(jumps[0].norm, jumps[1].norm))
+            change = in_words(relative_change(jumps[0].norm, jumps[1].norm))
             yield f"with joint model '{name}' (x = {compression.x:.2g}) the jump {change}"

@@ -1,0 +1,56 @@
+"""How far the joints can move the contact along its normal: in a singular direction, they cannot yield."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from impact_posture.config.json_block import json_block
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.robot.model_joints import v_slice
+from impact_posture.system.arrays import Array, null_space
+
+# The direction is singular if the joints move the contact along the normal by less than this share of the motion in
+# their best direction.  A singular value of the feet below the second share is a rounding error.
+_SINGULAR, _RANK = 0.05, 1e-9
+
+
+@dataclass(frozen=True)
+class JointYield:
+    """Motion of the contact per unit joint velocity ``‖v‖ = 1``, with feet in place and without other base motion.
+
+    Attributes:
+        along: Largest speed of the contact along the normal, m/rad: the singular value of ``nᵀJ`` of the joints.
+        largest: Largest speed of the contact in any direction, m/rad: the largest singular value of ``J`` of the
+            joints.
+    """
+
+    along: float
+    largest: float
+
+    @property
+    def singular(self) -> bool:
+        """Whether the joints cannot yield along the normal."""
+        return self.along < _SINGULAR * self.largest
+
+    def to_dict(self) -> dict[str, object]:
+        """Return JSON content."""
+        return json_block(self) | {"singular": self.singular}
+
+
+def joint_yield(objective: WorstCaseObjective, q: Array) -> JointYield | None:
+    """Return how the joints move the leading contact at ``q``, shape (nq,); ``None`` if no joint moves it."""
+    robot, oracle = objective.robot, objective.oracle.at(q)
+    moving = ~oracle.numeric.locked
+    if robot.floating and not objective.supports:
+        moving[:6] = False
+    J, feet = oracle.J[:, moving], oracle.Js[:, moving]
+    basis = null_space(feet, _RANK) if len(feet) else np.eye(J.shape[1])
+    joints = np.ones(robot.nv, dtype=bool)
+    if robot.floating:
+        joints[v_slice(robot.model, 1)] = False
+    # Motions y of the basis with joint velocities v = N y: the contact moves by J N N_j⁺ v.
+    motion = J @ basis @ np.linalg.pinv(basis[joints[moving]])
+    largest = float(np.linalg.norm(motion, 2)) if motion.size else 0.0
+    return JointYield(float(np.linalg.norm(oracle.n @ motion)), largest) if largest > 0 else None

@@ -1,0 +1,109 @@
+"""Conditions under which a verdict holds; they come before its numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import chain
+
+from impact_posture.config.json_block import json_block
+from impact_posture.impact.evaluation.evaluation import Evaluation
+from impact_posture.impact.resolved_impact import ResolvedImpact
+
+# If the attainable speed is below the approach speed by less than this share, the posture can arrive, because the
+# verdict shows only three digits of both speeds.
+_REACHED = 5e-3
+# A distance (rad, m) up to this value is a rounding error.
+_STILL = 1e-6
+
+
+@dataclass(frozen=True)
+class Condition:
+    """One condition of a verdict.
+
+    Attributes:
+        key: ``arrival``, ``singular``, ``feet``, ``contact point`` or ``start``.
+        line: The condition in words, without a full stop.
+        hint: What the user can do; empty if there is nothing to do.
+        refutes: Whether the verdict has no meaning, because the condition does not hold.
+    """
+
+    key: str
+    line: str
+    hint: str = ""
+    refutes: bool = False
+
+    def to_dict(self) -> dict[str, object]:
+        """Return JSON content."""
+        return json_block(self)
+
+
+@dataclass(frozen=True)
+class Circumstances:
+    """What is known of an optimization beyond the impact in its two postures.
+
+    Attributes:
+        attainable: Highest speed at which the joints can bring the contact to the surface in the optimal posture,
+            m/s; ``None`` if unknown or unbounded.
+        moved: Distance from the given to the initial posture, rad mixed with m.
+    """
+
+    attainable: float | None = None
+    moved: float = 0.0
+
+
+def conditions(
+    impact: ResolvedImpact, before: Evaluation, after: Evaluation, known: Circumstances
+) -> tuple[Condition, ...]:
+    """Return the conditions of the verdict on the posture of ``after``, the gravest first."""
+    parts = _singular(after), _feet(impact, before, after), _touch(impact, after), _start(known)
+    return (*_arrival(impact, known), *chain.from_iterable(parts))
+
+
+def _arrival(impact: ResolvedImpact, known: Circumstances) -> Iterator[Condition]:
+    if known.attainable is not None and known.attainable < (1 - _REACHED) * impact.speed:
+        yield Condition(
+            "arrival",
+            f"cannot arrive at {impact.speed:g} m/s ({known.attainable:.2g} m/s at most)",
+            "add `approach`, or correct the `speed`",
+            refutes=True,
+        )
+
+
+def _singular(after: Evaluation) -> Iterator[Condition]:
+    motion = after.joint_yield
+    if motion is not None and motion.singular:
+        yield Condition(
+            "singular",
+            f"the contact direction is singular (the joints move the contact by {motion.along:.2g} m/rad along the "
+            f"normal, at most {motion.largest:.2g} m/rad): the impact meets the inertia of the whole robot, "
+            "and the joints cannot yield",
+        )
+
+
+def _feet(impact: ResolvedImpact, before: Evaluation, after: Evaluation) -> Iterator[Condition]:
+    friction = impact.contact.friction
+    now = _faults(after, friction)
+    if now:
+        too = ", before and after" if now == _faults(before, friction) else ""
+        hint = "`keep_contacts` admits only postures whose feet stay"
+        yield Condition("feet", f"holds only if the feet stay; {' and '.join(now)}{too}", hint)
+
+
+def _faults(evaluation: Evaluation, friction: float) -> list[str]:
+    """Return what the impacts at all contacts do to the feet, without repetition."""
+    parts = [part.contact_stability for part in evaluation.contacts or (evaluation,)]
+    return list(dict.fromkeys(filter(None, (part.fault(friction) for part in parts if part is not None))))
+
+
+def _touch(impact: ResolvedImpact, after: Evaluation) -> Iterator[Condition]:
+    for touch in impact.early_touches(after.q):
+        yield Condition("contact point", f"holds only if the contact point touches first; {touch.fact}")
+
+
+def _start(known: Circumstances) -> Iterator[Condition]:
+    if known.moved > _STILL:
+        yield Condition(
+            "start",
+            f"the given posture violates the constraints, so 'before' is {known.moved:.3g} (rad, m) away from it",
+        )
