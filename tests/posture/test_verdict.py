@@ -115,13 +115,14 @@ def test_a_posture_that_cannot_arrive_says_so_first() -> None:
     told = verdict(impact, q, q, Circumstances(attainable=0.0163))
     assert told.line.startswith("verdict: cannot arrive at 1 m/s (0.016 m/s at most)")
     assert told.outcome == "cannot arrive" and any("`approach`" in line for line in told.advice)
-    assert verdict(impact, q, q, Circumstances(attainable=0.999)).conditions == ()
+    reached = verdict(impact, q, q, Circumstances(attainable=0.999))
+    assert "arrival" not in [condition.key for condition in reached.conditions]
 
 
 def test_a_start_that_was_moved_is_said_with_how_far() -> None:
     impact = resolved("panda")
     told = verdict(impact, impact.evaluate(), impact.evaluate(), Circumstances(moved=0.25))
-    assert [condition.key for condition in told.conditions] == ["start"] and "0.25 (rad, m) away" in told.line
+    assert told.conditions[-1].key == "start" and "0.25 (rad, m) away" in told.line
 
 
 def test_a_stretched_arm_is_singular_along_its_axis() -> None:
@@ -154,7 +155,7 @@ def test_feet_that_the_impact_lifts_come_first() -> None:
     assert evaluation.contact_stability is not None
     lifted = [foot.frame for foot in evaluation.contact_stability.feet if foot.lifts]
     assert lifted and told.line.startswith("verdict: holds only if the feet stay; the impact lifts ")
-    assert f"lifts {', '.join(lifted)}, before and after. No better." in told.line
+    assert f"lifts {', '.join(lifted)}, before and after" in told.line and ". No better. At 1 m/s" in told.line
 
 
 def test_a_posture_against_itself() -> None:
