@@ -9,7 +9,8 @@ import difflib
 import reprlib
 import unicodedata
 from collections.abc import Iterable
-from typing import ClassVar
+from pathlib import Path
+from typing import ClassVar, Self
 
 # Largest number of characters of a name in a message.  The middle of a longer name is left out.
 _LONGEST_NAME = 200
@@ -113,6 +114,13 @@ class ImpactPostureError(Exception):
 
 class InputError(ImpactPostureError):
     """A value given by the user is wrong."""
+
+    @classmethod
+    def unreadable(cls, path: Path, error: Exception, hint: str = "check the file") -> Self:
+        """Return the error for a file that is missing or cannot be read."""
+        if isinstance(error, FileNotFoundError):
+            return cls("no such file", where=str(path), hint="check the path")
+        return cls(f"cannot be read ({_reason(error)})", where=str(path), hint=hint)
 
 
 class NameNotFound(InputError):
@@ -223,6 +231,11 @@ class UnsupportedJoint(InputError):
 class OutputError(InputError):
     """An output folder exists or cannot be written."""
 
+    @classmethod
+    def unwritable(cls, path: Path, error: Exception, hint: str) -> Self:
+        """Return the error for a file or folder that cannot be written."""
+        return cls(f"cannot be written ({_reason(error)})", where=str(path), hint=hint)
+
 
 class CompilerError(InputError):
     """The C compiler is missing or failed; the error contains the command and the output."""
@@ -238,6 +251,10 @@ class ManifestMismatch(InputError):
             where=where,
             hint=hint or "export again for this robot (impact-posture codegen)",
         )
+
+
+def _reason(error: Exception) -> object:
+    return getattr(error, "strerror", None) or error
 
 
 def _short(value: object) -> str:

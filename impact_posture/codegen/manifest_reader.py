@@ -106,8 +106,7 @@ def read_checked(
     try:
         manifest = json.loads(read_text(file))
     except (OSError, ValueError, RecursionError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise SpecError(f"cannot be read ({reason})", where=str(file), hint="run codegen again") from None
+        raise SpecError.unreadable(file, error, "run codegen again") from None
     if not isinstance(manifest, dict) or manifest.get("schema") != schema:
         hint = f"name the folder that {command} wrote, or run codegen again"
         raise SpecError(f"is not a manifest of an {what}", where=str(file), hint=hint)

@@ -94,10 +94,8 @@ def read_toml(path: Path) -> dict[str, object]:
     """
     try:
         return tomllib.loads(read_text(path))
-    except FileNotFoundError:
-        raise SpecError("no such file", where=str(path), hint="check the path") from None
     except (OSError, UnicodeDecodeError) as error:
-        raise SpecError(f"cannot be read ({error})", where=str(path), hint="check the file") from None
+        raise SpecError.unreadable(path, error) from None
     except RecursionError:
         raise SpecError("is nested too deeply", where=str(path), hint="correct the syntax") from None
     except ValueError as error:  # TOMLDecodeError, or a number has more digits than Python converts.

@@ -66,7 +66,7 @@ def daqp_sources(folder: Path | None = None) -> dict[str, bytes]:
         with tarfile.open(archive) as tar:
             return _checked(lambda name: _from_archive(tar, name), str(archive), again)
     except (OSError, EOFError, tarfile.TarError) as error:
-        raise InputError(f"cannot be read ({error})", where=str(archive), hint=again) from None
+        raise InputError.unreadable(archive, error, again) from None
 
 
 def renamed(sources: dict[str, bytes], prefix: str) -> dict[str, str]:
@@ -106,7 +106,7 @@ def _from_folder(folder: Path, name: str) -> bytes | None:
             if path.is_file() and path.stat().st_size <= _LARGEST:
                 return path.read_bytes()
         except OSError as error:
-            raise InputError(f"cannot be read ({error.strerror})", where=str(path), hint=_FOLDER_HINT) from None
+            raise InputError.unreadable(path, error, _FOLDER_HINT) from None
     return None
 
 

@@ -59,8 +59,7 @@ def write_draft(robot: str, options: LoadOptions, out: Path | None, *, force: bo
         else:
             os.link(temporary, out)  # Fails if another process has made the file in the meantime.
     except OSError as error:
-        fault = f"cannot be written ({error.strerror or error})"
-        raise OutputError(fault, where=str(out), hint="name another file") from None
+        raise OutputError.unwritable(out, error, "name another file") from None
     finally:
         temporary.unlink(missing_ok=True)
     return out, draft

@@ -81,10 +81,8 @@ def _load(path: Path) -> Mapping[str, object]:
         # `ros2 topic echo` ends each message with `---`, so only the first document is read.  BaseLoader keeps
         # scalars as text.  Other loaders read 1:30 as 90 and a joint name `on` as true, and fail on unknown tags.
         data = json.loads(text) if kind == "JSON" else next(yaml.load_all(text, yaml.BaseLoader), None)
-    except FileNotFoundError:
-        raise PostureError("no such file", where=str(path), hint="check the path") from None
     except OSError as error:
-        raise PostureError(f"cannot be read ({error.strerror})", where=str(path), hint="check the file") from None
+        raise PostureError.unreadable(path, error) from None
     except (ValueError, yaml.YAMLError, RecursionError) as error:
         raise PostureError(f"is not valid {kind} ({error})", where=str(path), hint="correct the syntax") from None
     if not isinstance(data, dict):

@@ -145,10 +145,8 @@ def parse_urdf(path: Path) -> ET.Element:
         raise UrdfError("is a folder", where=str(path), hint="name the .urdf file in it")
     try:
         root = ET.parse(path).getroot()
-    except FileNotFoundError:
-        raise UrdfError("no such file", where=str(path), hint="check the path") from None
     except OSError as error:
-        raise UrdfError(f"cannot be read ({error.strerror})", where=str(path), hint="check the file") from None
+        raise UrdfError.unreadable(path, error) from None
     except (ET.ParseError, ValueError) as error:  # Path raises ValueError for a name with a null character.
         raise UrdfError(f"is not XML ({error})", where=str(path), hint="give a URDF file") from None
     if root.tag != "robot":

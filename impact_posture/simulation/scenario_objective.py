@@ -92,8 +92,7 @@ def locked(path: Path) -> Iterator[None]:
     try:
         file = path.open("w")
     except OSError as error:
-        what, hint = f"cannot be written ({error.strerror})", "set IMPACT_POSTURE_CACHE to a folder"
-        raise OutputError(what, where=str(path.parent), hint=hint) from None
+        raise OutputError.unwritable(path.parent, error, "set IMPACT_POSTURE_CACHE to a folder") from None
     with file:
         fcntl.flock(file, fcntl.LOCK_EX)
         yield

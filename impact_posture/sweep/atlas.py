@@ -75,10 +75,8 @@ class Atlas:
                 self.folder.mkdir(parents=True, exist_ok=True)
                 write_record(self.folder, "sweep")
             except OSError as error:
-                words = f"cannot be written ({error.strerror or error})"
-                raise OutputError(
-                    words, where=str(self.folder), hint="free disk space or choose another `out`"
-                ) from None
+                hint = "free disk space or choose another `out`"
+                raise OutputError.unwritable(self.folder, error, hint) from None
             write_whole(manifest, json.dumps(self._manifest(), indent=1) + "\n")
         known = read_manifest(self.folder)
         if known["key"] != self._key:
@@ -139,8 +137,7 @@ class Atlas:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            words = f"cannot be made ({error.strerror or error})"
-            raise OutputError(words, where=str(path.parent), hint="check the disk and permissions") from None
+            raise OutputError.unwritable(path.parent, error, "check the disk and permissions") from None
         write_whole(path, content)
 
     def _path(self, shard: int, place: str = _DATA) -> Path:

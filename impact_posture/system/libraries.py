@@ -99,9 +99,8 @@ def building(library: Path) -> Iterator[Path]:
             if (built := folder / library.name).is_file():
                 _replace(library, built)
     except OSError as error:
-        fault = f"cannot be written ({error.strerror or error})"
         hint = "free some space or check the permissions; IMPACT_POSTURE_CACHE names another cache"
-        raise OutputError(fault, where=str(library.parent), hint=hint) from None
+        raise OutputError.unwritable(library.parent, error, hint) from None
 
 
 def _replace(library: Path, built: Path) -> None:
@@ -191,8 +190,7 @@ def cache_folder(*parts: str) -> Path:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             check_private(folder)
     except OSError as error:
-        fault = f"cannot be written ({error.strerror})"
-        raise OutputError(fault, where=str(folder), hint="set IMPACT_POSTURE_CACHE to a folder") from None
+        raise OutputError.unwritable(folder, error, "set IMPACT_POSTURE_CACHE to a folder") from None
     return folder
 
 

@@ -64,8 +64,7 @@ def check_name(out: Path) -> None:
     except (FileNotFoundError, NotADirectoryError):
         pass
     except (OSError, ValueError) as error:
-        fault = f"cannot be written ({getattr(error, 'strerror', None) or error})"
-        raise OutputError(fault, where=str(out), hint="choose another `out`") from None
+        raise OutputError.unwritable(out, error, "choose another `out`") from None
 
 
 @contextmanager
@@ -169,8 +168,7 @@ def write_whole(path: Path, content: str | bytes) -> None:
                 file.write(content.encode() if isinstance(content, str) else content)
             os.replace(beside, path)
     except OSError as error:
-        hint = "check the disk and permissions"
-        raise OutputError(f"cannot be written ({error.strerror})", where=str(path), hint=hint) from None
+        raise OutputError.unwritable(path, error, "check the disk and permissions") from None
 
 
 def _check_ours(out: Path, kind: Kind) -> None:
@@ -257,6 +255,5 @@ def parents_of(out: Path) -> Iterator[None]:
             for folder in reversed(missing):
                 folder.mkdir(exist_ok=True)
         except OSError as error:
-            fault = f"cannot be made ({error.strerror})"
-            raise OutputError(fault, where=str(error.filename), hint="choose another `out`") from None
+            raise OutputError.unwritable(Path(error.filename), error, "choose another `out`") from None
         yield

@@ -235,6 +235,5 @@ def save(figure: Figure, out_dir: Path, name: str, formats: Iterable[str] = DEFA
                     figure.savefig(beside / path.name, metadata=metadata)
                 os.replace(beside / path.name, path)
         except OSError as error:
-            fault = f"cannot be written ({error.strerror or error})"
-            raise OutputError(fault, where=str(path), hint="choose another folder") from None
+            raise OutputError.unwritable(path, error, "choose another folder") from None
     return paths
