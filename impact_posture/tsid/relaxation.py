@@ -9,7 +9,7 @@ import numpy as np
 
 from impact_posture.system.arrays import Array, null_space
 from impact_posture.tsid.assembly import Assembly
-from impact_posture.tsid.qp.daqp_solver import SOLVED, DaqpSolver
+from impact_posture.tsid.qp.daqp_solver import SETTINGS, SOLVED, DaqpSolver
 from impact_posture.tsid.qp.hierarchy import Level, lexicographic
 from impact_posture.tsid.qp.quadratic_program import EQUALITY, QP, Solved
 
@@ -20,7 +20,7 @@ _MISSES = 1e-9
 # Largest violation of a bound by a result, relative as for ``_MISSES``.
 _ROUNDING = 1e-13
 # Bound that DAQP treats as infinite, and the settings of DAQP for the scaled program of the cost.
-_FAR, _SETTINGS = 1e30, {"primal_tol": 1e-11, "sing_tol": 1e-13, "iter_limit": 1000}
+_FAR, _SETTINGS = 1e30, SETTINGS | {"primal_tol": 1e-11}
 # Smaller curvatures of the cost, relative to the largest, are raised to this value.
 _FLATTEST = 1e-14
 # Weight of the proximal-point iterations with which DAQP decides whether strict levels can hold.

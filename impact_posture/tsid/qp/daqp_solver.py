@@ -16,7 +16,7 @@ _FAILED = 0
 # primal_tol is the largest violation of a bound.  iter_limit is the largest number of iterations.  sing_tol is the
 # squared sine of the smallest angle between a row and the active rows.  For a quadruped, the cost has the condition
 # number 4e10 and makes rows nearly parallel.  The DAQP default of 3.7e-11 would treat these rows as dependent.
-_SETTINGS = {"primal_tol": 1e-9, "iter_limit": 1000, "sing_tol": 1e-13}
+SETTINGS = {"primal_tol": 1e-9, "iter_limit": 1000, "sing_tol": 1e-13}
 
 
 class DaqpSolver:
@@ -33,7 +33,7 @@ class DaqpSolver:
         """
         self._flag = 1
         self._model = daqp.Model()
-        self._model.settings = _SETTINGS if proximal is None else _SETTINGS | {"eps_prox": proximal}
+        self._model.settings = SETTINGS if proximal is None else SETTINGS | {"eps_prox": proximal}
         # The first program only sets the dimensions, and its bounds are so wide that they are never active.
         blank, upper = QP.empty(n, m), np.full(n + m, 1e30)
         self._model.setup(blank.H, blank.g, blank.A, upper, -upper, blank.sense)
