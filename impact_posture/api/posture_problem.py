@@ -10,6 +10,7 @@ import numpy as np
 
 from impact_posture.config.checked import checked
 from impact_posture.config.problem_settings import RESTITUTION, SPEED, ImpactSettings, ProblemSettings, RobotSettings
+from impact_posture.config.setting import stated
 from impact_posture.config.table_validation import validate
 from impact_posture.errors import InputError
 from impact_posture.impact.elasticity.contact_compression import ContactStiffness
@@ -64,7 +65,9 @@ class PostureProblem:
             q, name = robot.check_posture(np.asarray(posture, dtype=float), where="posture"), "a configuration"
         loaded = robot.settings or RobotSettings(robot=robot.source)
         values = {field.name: getattr(loaded, field.name) for field in fields(RobotSettings)}
-        values |= {"speed": speed, "restitution": restitution, "joint_model": robot.joint_model}
+        values |= {"restitution": restitution, "joint_model": robot.joint_model}
+        if stated(speed):
+            values["speed"] = speed
         if isinstance(objective, WorstCaseObjective):
             values["friction"] = objective.contact.friction
         for name in _OF_THE_OBJECTIVE & set(task):

@@ -32,7 +32,7 @@ from impact_posture.config.demand import (
 )
 from impact_posture.config.demand import Vector3 as Vector3
 from impact_posture.config.obstacle import Obstacle
-from impact_posture.config.setting import CONTACT, LIMITS, METRIC, ROBOT, SEARCH, TASK, setting
+from impact_posture.config.setting import CONTACT, LIMITS, METRIC, ROBOT, SEARCH, TASK, Unstated, setting
 from impact_posture.config.table_validation import StrictTable
 from impact_posture.config.text_parsers import parse_armature, parse_number_or_name, parse_payloads
 
@@ -59,11 +59,11 @@ MATERIALS = {"steel": (200e9, 0.28), "wood": (11.5e9, 0.3), "rubber": (0.03e9, 0
 # stand behind its plane.
 CLEARANCE, PATCH = 0.001, 0.3
 # Default friction coefficient (Coulomb).
-FRICTION = 0.7
+FRICTION = Unstated(0.7)
 # Default number of starts; number of bounds if --tradeoff is given without a number.
 STARTS, TRADEOFF_POINTS = 16, 16
 # Default approach speed (m/s) and coefficient of restitution of predicted jumps.
-SPEED, RESTITUTION = 1.0, 0.0
+SPEED, RESTITUTION = Unstated(1.0), 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,9 +152,10 @@ class ImpactSettings(RobotSettings):
         METRIC,
         "FILE|velocity-limits",
     )
-    objective: ObjectiveChoice = setting(
-        "impulse", "Minimize H (impulse), V (speed), S (sticking), C (coulomb) or E (energy).", METRIC
-    )
+    objective: ObjectiveChoice | None = setting(
+        None, "Minimize H (impulse), V (speed), S (sticking), C (coulomb) or E (energy).", METRIC,
+        words="auto with --speed, --friction or a contact's elasticity, else impulse",
+    )  # fmt: skip
     joint_model: JointModel = setting(
         "reflected", "Inertia of the rotors at the joints; elastic only with evaluate.", METRIC
     )
@@ -214,7 +215,10 @@ class ProblemSettings(ImpactSettings):
         True, "Keep joint torques, thrusts and foot forces within their limits at rest.", LIMITS,
         option="--holdable/--no-holdable",
     )  # fmt: skip
-    approach: bool = setting(False, "Joint velocity limits must allow --speed at the contact.", LIMITS)
+    approach: bool | None = setting(
+        None, "Joint velocity limits must allow --speed at the contact.", LIMITS,
+        words="on with --speed, unless the robot flies", option="--approach/--no-approach",
+    )  # fmt: skip
     hold_force: Annotated[float, between(0.0, 1e6, "N")] = setting(
         0.0, "Force along the normal that the robot must also sustain after the impact, N.", LIMITS, "N"
     )

@@ -6,6 +6,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+
+class Unstated(float):
+    """A default number, which can be told from the same number that a user states."""
+
+
+def stated(value: float | str | None) -> bool:
+    """Return whether a user stated a setting: it is neither ``None`` nor a default number."""
+    return value is not None and not isinstance(value, Unstated)
+
+
 CONTACT, METRIC, ROBOT = "Contact", "Measure", "Robot"
 TASK, LIMITS, SEARCH, OUTPUT = "Task", "Limits of the task", "Search", "Output"
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from impact_posture.config.problem_settings import ImpactSettings, ObjectiveKind, Vector3
+from impact_posture.config.setting import stated as is_stated
 from impact_posture.config.text_parsers import parse_contact
 from impact_posture.errors import ContactError, FrameNotFound
 from impact_posture.impact.contact_point import EarlyTouch, at_front, early_touches
@@ -25,6 +26,9 @@ from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.robot.robot_spec import Support
 from impact_posture.system.arrays import Array
+
+# Without a stated objective, each of these settings selects ``auto``.
+_CHOOSING = ("speed", "friction", "contact_stiffness", "contact_duration")
 
 FLOATS = "because its data name neither feet nor rotors"
 
@@ -82,9 +86,19 @@ def held_by_default(robot: Robot) -> tuple[str, ...]:
 
 
 def _choose(settings: ImpactSettings, *, several: bool) -> tuple[ObjectiveKind, str]:
-    """Return the objective type, and the reason for this choice if the setting is ``auto`` (otherwise empty)."""
-    if settings.objective != "auto":
+    """Return the objective type, and the reason if it is chosen automatically (otherwise empty)."""
+    stated = [name for name in _CHOOSING if is_stated(getattr(settings, name))]
+    if settings.objective is None and not stated:
+        return "impulse", ""
+    if settings.objective is not None and settings.objective != "auto":
         return settings.objective, ""
+    kind, reason = _automatic(settings, several=several)
+    given = ", ".join(f"`{name}`" for name in stated)
+    return kind, reason if settings.objective == "auto" else f"{reason} (auto, because {given} is given)"
+
+
+def _automatic(settings: ImpactSettings, *, several: bool) -> tuple[ObjectiveKind, str]:
+    """Return the objective type that ``auto`` chooses, and the reason for it."""
     if several:
         return "impulse", "objective impulse: for several contacts at once, only bounds on the impulses are known"
     if settings.speed == 0:

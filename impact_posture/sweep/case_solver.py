@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from impact_posture.config.setting import Unstated
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.impact.impact_contact import point_on
 from impact_posture.impact.resolved_impact import resolve
@@ -59,7 +60,9 @@ class CaseSolver:
     def normal_and_speed(self, values: Mapping[str, Any]) -> tuple[Any, float]:
         """Return normal and speed for ``values`` of the grid axes.  They determine the problem up to its target."""
         settings = self._case.settings
-        return values.get("normal", settings.normal), values.get("speed", settings.speed)
+        # A speed of the grid selects neither the objective nor the constraint on the approach.
+        speed = Unstated(values["speed"]) if "speed" in values else settings.speed
+        return values.get("normal", settings.normal), speed
 
     def _template(self, normal: Any, speed: float) -> Prepared:
         """Return the problem for a normal and a speed.  :meth:`target` later replaces the target of this problem."""

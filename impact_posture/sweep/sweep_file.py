@@ -207,10 +207,12 @@ def read_sweep(path: Path) -> Sweep:
         raise SpecError(
             "a sweep does not support `tradeoff`, `path` and `search`", where=where, hint="remove these keys"
         )
+    # A speed of the grid must not look like a stated speed, which would select the objective.
+    stated = {name: value for name, value in (problem | first).items() if name != "speed" or "speed" not in first}
     cases = []
     for combination in product(*(values[name] for name in outer)):
         case = dict(zip(outer, combination, strict=True))
-        table = from_folder(problem | first | case, folder, [name for name in _FILES if name in outer])
+        table = from_folder(stated | case, folder, [name for name in _FILES if name in outer])
         cases.append(Case(validate(ProblemSettings, table, str(path)), case))
     return Sweep(tuple(cases), tuple(Axis(name, values[name]) for name in outer), Grid(axes), settings.shard)
 

@@ -154,7 +154,9 @@ def test_inspect_pages_fit_the_terminal() -> None:
 
 
 def test_evaluate_numbers_against_pinocchio() -> None:
-    output = document(*PUSH, "--speed", "0.5", "--restitution", "0.2", "--offset", "0", "0", "0.02")
+    output = document(
+        *PUSH, "--objective", "impulse", "--speed", "0.5", "--restitution", "0.2", "--offset", "0", "0", "0.02"
+    )
     loaded = robot("tilthex_arm")
     q, n = loaded.posture(), np.array([0.0, 0.0, 1.0])
     M = mass_matrix(loaded.model, q)

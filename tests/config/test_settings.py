@@ -91,7 +91,7 @@ def test_resolved_settings_are_the_same_problem(more: dict[str, object], tmp_pat
     path.write_text(dump_settings(resolved_settings(first)), encoding="utf-8-sig" if more else "utf-8")
     again = prepare(read_settings(path))
     assert again.impact.to_dict() == first.impact.to_dict()
-    assert again.problem.requirements == replace(first.problem.requirements, com_asked=True)
+    assert again.problem.requirements == replace(first.problem.requirements, com_asked=True, approach_asked=True)
     q = first.impact.robot.posture()
     assert again.problem.objective.value(q) == first.problem.objective.value(q)
 

@@ -169,6 +169,8 @@ def test_the_bounds_hold_and_cost(name: str, more: dict[str, object]) -> None:
     settings_ = {
         "robot": name,
         "normal": (0.0, 0.0, 1.0),
+        "objective": "impulse",
+        "approach": False,
         "contact_stiffness": 1e5,
         "speed": 0.8,
         "starts": 3,

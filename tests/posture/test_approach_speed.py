@@ -43,7 +43,15 @@ PROBLEMS: dict[str, dict[str, object]] = {
 
 @functools.cache
 def prepared(name: str, speed: float = 0.5, **more: object) -> Prepared:
-    over = {"robot": name, "collision": False, "speed": speed, "approach": True, **PROBLEMS[name], **more}
+    over = {
+        "robot": name,
+        "collision": False,
+        "objective": "impulse",
+        "speed": speed,
+        "approach": True,
+        **PROBLEMS[name],
+        **more,
+    }
     return prepare(make_settings(over))
 
 

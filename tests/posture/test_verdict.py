@@ -19,7 +19,13 @@ from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.posture.analysis.verdict import verdict
 from impact_posture.posture.analysis.verdict_changes import PredictedImpact, changes, outcome_of
 from impact_posture.posture.analysis.verdict_conditions import Circumstances
-from impact_posture.posture.formulation.problem_file import dump_settings, prepare, resolved_settings
+from impact_posture.posture.approach.approach_speed import ApproachSpeed
+from impact_posture.posture.formulation.problem_file import (
+    dump_settings,
+    prepare,
+    read_settings,
+    resolved_settings,
+)
 from impact_posture.posture.search.multistart import solve
 from impact_posture.robot.robot_spec import TransmissionSpec
 from tests.support.arms import TIP, Y, arm
@@ -271,3 +277,48 @@ def test_another_objective_is_advised_only_if_it_minimizes_the_jump(
     assert told.outcome == "no better"
     advised = [line for line in told.advice if "minimizes this whole jump" in line]
     assert [line.split()[1] for line in advised] == ([] if better is None else [better])
+
+
+@pytest.mark.parametrize(
+    ("more", "kind"),
+    [
+        ({}, "impulse"),
+        ({"speed": 1.0}, "coulomb"),
+        ({"friction": 0.7}, "coulomb"),
+        ({"friction": 0.0}, "speed"),
+        ({"contact_stiffness": "wood"}, "coulomb"),
+        ({"contact_duration": 0.01}, "coulomb"),
+        ({"speed": 1.0, "objective": "impulse"}, "impulse"),
+    ],
+)
+def test_a_stated_speed_friction_or_elasticity_selects_auto(
+    more: dict[str, object], kind: str, tmp_path: Path
+) -> None:
+    """Also a stated number that equals the default.  The problem that is written has the same objective."""
+    prepared = prepare(make_settings({"robot": "panda", **NORMAL, **more}))
+    assert prepared.impact.objective.kind == kind
+    assert ("(auto, because `" in prepared.impact.choice) == (bool(more) and "objective" not in more)
+    path = tmp_path / "problem.toml"
+    path.write_text(dump_settings(resolved_settings(prepared)))
+    again = prepare(read_settings(path))
+    assert again.impact.objective.kind == kind and not again.impact.choice
+    assert again.problem.describe() == prepared.problem.describe()
+
+
+@pytest.mark.parametrize(
+    ("robot", "more", "approaches"),
+    [
+        ("panda", {}, False),
+        ("panda", {"speed": 0.3}, True),
+        ("panda", {"speed": 0.3, "approach": False}, False),
+        ("panda", {"approach": True}, True),
+        ("tilthex_arm", {"speed": 0.3}, False),
+        ("talos", {"speed": 0.3, "normal": (-1.0, 0.0, 0.0), "frame": "gripper_right_base_link"}, True),
+    ],
+)
+def test_a_stated_speed_must_be_reached_unless_the_robot_flies(
+    robot: str, more: dict[str, object], approaches: bool
+) -> None:
+    prepared = prepare(make_settings({"robot": robot, **NORMAL, "objective": "impulse", **more}))
+    assert any(isinstance(c, ApproachSpeed) for c in prepared.problem.constraints) == approaches
+    assert resolved_settings(prepared).approach == approaches

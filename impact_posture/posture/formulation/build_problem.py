@@ -76,9 +76,14 @@ def build_problem(robot: Robot, objective: Objective, given: Array, requirements
     if requirements.approach_speed > 0:
         attainable = AttainableSpeed(robot, objective, requirements)
         if attainable.unknown:
-            decided.append(f"the speed of the approach is not required: {attainable.unknown}")
+            note = f"the speed of the approach is not required: {attainable.unknown}"
+            decided += [note] if requirements.approach_asked else []
         else:
-            constraints.append(ApproachSpeed(attainable, requirements.approach_speed))
+            try:
+                constraints.append(ApproachSpeed(attainable, requirements.approach_speed))
+            except InputError:
+                if requirements.approach_asked:
+                    raise
     lower, upper = _bounds(Chart(robot.model), given, requirements)
     loads = load_cases(objective, given, requirements) if requirements.holdable else LoadCases()
     fixed, notes = fix_undetermined_motions(robot, objective, numeric, requirements, constraints)

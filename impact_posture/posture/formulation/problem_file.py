@@ -9,11 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from impact_posture.config.problem_settings import ProblemSettings
+from impact_posture.config.setting import stated
 from impact_posture.config.table_validation import read_toml, validate
 from impact_posture.errors import InputError, SpecError
 from impact_posture.impact.elasticity.contact_compression import ContactStiffness
 from impact_posture.impact.objective import Objective
 from impact_posture.impact.resolved_impact import FLOATS, ResolvedImpact, held_by_default, resolve
+from impact_posture.posture.approach.approach_speed import ApproachSpeed
 from impact_posture.posture.approach.attainable_speed import FASTEST
 from impact_posture.posture.constraints.center_of_mass_over_feet import CenterOfMassOverFeet
 from impact_posture.posture.constraints.requirements import Requirements
@@ -111,7 +113,8 @@ def requirements(settings: ProblemSettings, objective: Objective) -> Requirement
         what = "needs an approach speed above zero"
         raise InputError(what, where="approach", hint=f"give `speed`, up to {FASTEST:g} m/s")
     worked_out = Requirements(
-        approach_speed=settings.speed if settings.approach else 0.0,
+        approach_speed=settings.speed if _approaches(settings, objective) else 0.0,
+        approach_asked=settings.approach is not None,
         contact_pose=poses[0] if poses else "free",
         other_poses=tuple(poses[1:]),
         base=settings.base or base,
@@ -125,6 +128,14 @@ def requirements(settings: ProblemSettings, objective: Objective) -> Requirement
     )
     shared = {f.name for f in fields(Requirements)} & {f.name for f in fields(ProblemSettings)} - _WORKED_OUT
     return replace(worked_out, **{key: getattr(settings, key) for key in shared})
+
+
+def _approaches(settings: ProblemSettings, objective: Objective) -> bool:
+    """Return whether the joints must reach the speed: as stated, else for a stated speed of a robot that stands."""
+    if settings.approach is not None:
+        return settings.approach
+    flies = objective.robot.floating and not objective.supports and settings.base != "fixed"
+    return stated(settings.speed) and 0 < settings.speed <= FASTEST and not flies
 
 
 def _largest_mass(settings: ProblemSettings) -> float:
@@ -181,6 +192,7 @@ def resolved_settings(prepared: Prepared) -> ProblemSettings:
         "metric": impact.metric.kind,
         "weights": impact.metric.weights,
         "objective": impact.objective.kind,
+        "approach": any(isinstance(c, ApproachSpeed) for c in prepared.problem.constraints),
         "normal_cone": impact.objective.normal_cone_deg,
         "bilateral": impact.objective.bilateral,
         "normal_frame": impact.contact.normal_frame,
