@@ -25,7 +25,7 @@ from impact_posture.output.plot import (
     save,
     save_all,
 )
-from impact_posture.output.plot.run_axes import AT_LIMIT, LIMIT, SHADES, STOP
+from impact_posture.output.plot.run_axes import AT_LIMIT, LIMIT, STOP
 from impact_posture.output.plot.run_figures import (
     comparison_figure,
     controls_comparison_figure,
@@ -36,7 +36,7 @@ from impact_posture.output.plot.run_figures import (
 from impact_posture.output.plot.run_panels import SHOWN
 from impact_posture.output.plot.skeleton import build_skeleton
 from impact_posture.output.plot.snapshots_figure import instants, snapshots_figure
-from impact_posture.output.plot.style import framed
+from impact_posture.output.plot.style import SHADES, framed
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.simulation.series import Window
 from tests.output.page import check_page

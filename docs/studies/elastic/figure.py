@@ -10,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from docs.studies.core import ROOT
-from impact_posture.output.plot.style import BLUE, GREEN, VERMILLION, WIDTH
+from impact_posture.output.plot.style import BLUE, GRAY, GREEN, PALE, VERMILLION, WIDTH
 
 if TYPE_CHECKING:
     from docs.studies.elastic.study import Row
@@ -42,12 +42,12 @@ def figure(rows: Sequence[Row]) -> Figure:
             medians = [100 * np.median(errors[place == k]) for k in full]
             axes.plot(middle, medians, "-" + mark, color=color, linewidth=1.6, markersize=4, label=model)
         for edge in (0.2, 0.75):
-            axes.axvline(edge, color="#6b6b6b", linewidth=0.8, linestyle=(0, (3, 2)))
+            axes.axvline(edge, color=GRAY, linewidth=0.8, linestyle=(0, (3, 2)))
         axes.set(xscale="log", yscale="log", title=title, xlabel=r"$x = T\sqrt{G/C}$")
         ticks = [0.05, 0.1, 0.2, 0.5, 1, 2]
         axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
         axes.minorticks_off()
-        axes.grid(True, linewidth=0.4, color="#d9d9d9")
+        axes.grid(True, linewidth=0.4, color=PALE)
     drawing.axes[0].set_ylabel("error against MuJoCo, %")
     drawing.axes[0].set_yticks([0.01, 0.1, 1, 10, 100], ["0.01", "0.1", "1", "10", "100"])
     drawing.legend(*drawing.axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3, frameon=False)

@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 
 from impact_posture.errors import InputError
 from impact_posture.output.plot.result_view import SEPARATOR, number
-from impact_posture.output.plot.style import AFTER_BAR, BEFORE_BAR, INK, VERMILLION, framed, shared_legend
+from impact_posture.output.plot.style import AFTER_BAR, BEFORE_BAR, INK, SMALL, VERMILLION, framed, shared_legend
 from impact_posture.system.escape import plot_label
 
 NOTES = (
@@ -76,7 +76,7 @@ def _panel(axes: Any, name: str, group: Sequence[Bar], room: int) -> None:
         if row.paper is not None:
             axes.plot(min(row.paper, 0.975 * end), place, **(_PAPER if row.paper in near else _BEYOND))
         # The values are written to the right of the panel, where no bar covers them.
-        look = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points", "va": "center", "fontsize": 7}
+        look = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points", "va": "center", "size": SMALL}
         axes.annotate(_words(row), (1.0, place), (5, 0), **look)
     axes.set_xlim(0.0, end)
     axes.set_ylim(room - 0.4, -0.6)

@@ -36,6 +36,7 @@ from impact_posture.output.plot.style import (
     GRAY,
     INK,
     PALE,
+    SMALL,
     WORST_AFTER,
     WORST_BEFORE,
     framed,
@@ -106,8 +107,8 @@ def square_panel(axes: Any, plane: Plane, limit: float, unit: str) -> None:
     axes.set_ylim(-limit, limit)
     axes.set_aspect("equal", adjustable="box")
     axes.locator_params(nbins=5)
-    axes.axhline(0.0, color="#d9d9d9", linewidth=0.6, zorder=0)
-    axes.axvline(0.0, color="#d9d9d9", linewidth=0.6, zorder=0)
+    axes.axhline(0.0, color=PALE, linewidth=0.6, zorder=0)
+    axes.axvline(0.0, color=PALE, linewidth=0.6, zorder=0)
     axes.set_xlabel(f"{plane.right}  [{unit}]")
     axes.set_ylabel(f"{plane.up}  [{unit}]", labelpad=1)
     axes.set_title(f"shadow on {plane.name}")
@@ -193,7 +194,7 @@ def _legend(axes: Any, states: list[_State], unit: str, view: ResultView) -> Non
         largest = max(float(radii[0]), 1e-300)
         rows.append(f"{state.word}  " + "  ".join(number(r if r > 1e-7 * largest else 0.0) for r in radii))
     # The annotation is relative to the legend, so the semi-axes are always below it.
-    look = {"xycoords": legend, "textcoords": "offset points", "va": "top", "fontsize": 7.0, "linespacing": 1.4}
+    look = {"xycoords": legend, "textcoords": "offset points", "va": "top", "fontsize": SMALL, "linespacing": 1.4}
     axes.annotate("\n".join(rows), (0, 0), (0, -8), **look)
 
 

@@ -19,7 +19,7 @@ from impact_posture.output.plot.result_view import (
     objective_unit,
     required,
 )
-from impact_posture.output.plot.style import BLUE, GRAY, GREEN, INK, PURPLE, VERMILLION, framed
+from impact_posture.output.plot.style import BLUE, GRAY, GREEN, INK, LEGEND, PURPLE, VERMILLION, framed
 from impact_posture.system.arrays import Array
 from impact_posture.system.escape import plot_label
 
@@ -69,12 +69,12 @@ def path_figure(view: ResultView) -> Figure:
                 "xycoords": ("data", "axes fraction"),
                 "textcoords": "offset points",
                 "ha": align,
-                "fontsize": 7.5,
+                "fontsize": LEGEND,
             }
             axes.annotate(word, (s, 1.0), (0, 3), **look)
         axes.set_xlabel("path length in the null space, ∫‖dq‖  [rad, mixed with m]")
         if drawn:
-            body.legend(loc="outside right center", title="value / start", title_fontsize=7.5, handlelength=3.2)
+            body.legend(loc="outside right center", title="value / start", title_fontsize=LEGEND, handlelength=3.2)
     return figure
 
 

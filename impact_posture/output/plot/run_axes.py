@@ -15,22 +15,16 @@ from matplotlib.ticker import LogLocator
 from impact_posture.output.plot.path_figures import log_axis, spreads
 from impact_posture.output.plot.run_panels import LINES, RUNS, Clip, Panel
 from impact_posture.output.plot.run_view import RunView, run_header
-from impact_posture.output.plot.style import GRAY, INK, framed, shared_legend
+from impact_posture.output.plot.style import BAND, GRAY, INK, SHADES, SMALL, framed, shared_legend
 from impact_posture.system.arrays import Array
 from impact_posture.system.escape import plot_label
 
-# These two colors also differ in a gray print.
-SHADES: dict[str, dict[str, Any]] = {
-    "dwell": {"facecolor": "#f0f0f0", "edgecolor": "none", "zorder": 0.1},
-    "impact": {"facecolor": "#edc3d6", "edgecolor": "none", "zorder": 0.2},
-}
 LIMIT: dict[str, Any] = {"color": INK, "linestyle": (0, (6, 3)), "linewidth": 0.8, "zorder": 1.5}
 STOP: dict[str, Any] = {"color": INK, "linewidth": 3.6, "alpha": 0.35, "zorder": 2.0, "solid_capstyle": "butt"}
 AT_LIMIT: dict[str, Any] = {
     "linestyle": "", "marker": "D", "markersize": 3.2, "color": INK, "markeredgecolor": "white",
     "markeredgewidth": 0.4, "zorder": 5,
 }  # fmt: skip
-BAND: dict[str, Any] = {"facecolor": "#dcdcdc", "edgecolor": "none", "zorder": 1.2}
 # Number of bins across a panel.
 _BINS = 1000
 
@@ -199,4 +193,4 @@ def _legend(body: Any, shared: Sequence[Any], named: Sequence[tuple[str, Any]]) 
     if not entries:
         for what, handles in [*groups, ("", shared)]:
             entries += [Line2D([], [], linestyle="", label=what or " "), *handles]
-    body.legend(handles=entries, loc="outside right center", handlelength=2.6, fontsize=7)
+    body.legend(handles=entries, loc="outside right center", handlelength=2.6, fontsize=SMALL)

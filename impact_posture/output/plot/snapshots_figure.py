@@ -25,13 +25,12 @@ from impact_posture.output.plot.postures_figure import (
 from impact_posture.output.plot.run_view import RunView, check_same, run_header
 from impact_posture.output.plot.silhouette import silhouette_handles
 from impact_posture.output.plot.skeleton import Skeleton, build_skeleton
-from impact_posture.output.plot.style import BLUE, GRAY, INK, PALE, VERMILLION, framed, shared_legend
+from impact_posture.output.plot.style import BLUE, GRAY, INK, PALE, START, TEXT, VERMILLION, framed, shared_legend
 from impact_posture.system.arrays import Array
 from impact_posture.system.escape import plot_label
 
 _START_NOTE = "Gray sticks show the robot at the start of the run."
 _NOW: dict[str, Any] = {"color": BLUE, "linestyle": "-", "linewidth": 1.5, "zorder": 3.0}
-_START: dict[str, Any] = {"color": "#a9a9a9", "linestyle": "-", "linewidth": 1.0, "zorder": 2.0}
 # Line styles of the arrow before a push and during a push.
 _PUSH: dict[int, dict[str, Any]] = {1: {"linestyle": (0, (2, 1.5)), "linewidth": 1.2}, 2: {"linewidth": 1.8}}
 # The snapshot before the impact is taken this long before it, s, so that its tick does not contain the impact.
@@ -82,14 +81,14 @@ def snapshots_figure(views: Sequence[RunView]) -> Figure:
             for column, (axes, state, (word, time)) in enumerate(zip(axes_row, row, instants(view), strict=True)):
                 _surface(axes, view, plane, low, high)
                 if column:
-                    draw_sticks(axes, row[0], _START, plane)
+                    draw_sticks(axes, row[0], START, plane)
                 draw_sticks(axes, state, _NOW, plane)
                 if arrow is not None and column:
                     contact = plane.axes @ state.contact
                     draw_arrow(axes, contact - arrow, contact, 7, color=VERMILLION, shrinkB=3, **_PUSH[column])
                 frame_flat(axes, low, high, 5)
                 first = f"{word}\n" * (view is views[0])
-                axes.set_title(f"{first}t = {max(time, 0.0):.2f} s", fontsize=8)
+                axes.set_title(f"{first}t = {max(time, 0.0):.2f} s", fontsize=TEXT)
             axes_row[0].set_ylabel(f"{plot_label(view.name)}\n{plane.up}  [m]")
         for axes in panels[-1]:
             axes.set_xlabel(f"{plane.right}  [m]")
@@ -136,7 +135,7 @@ def _arrow(view: RunView, plane: Plane, reach: float) -> Array | None:
 
 
 def _handles(state: Skeleton, view: RunView) -> list[Any]:
-    handles = [*robot_handles(state, {"now": _NOW, "start": _START}, BLUE), *silhouette_handles(state.hulls, BLUE)]
+    handles = [*robot_handles(state, {"now": _NOW, "start": START}, BLUE), *silhouette_handles(state.hulls, BLUE)]
     if view.surface is not None:
         return [*handles, Patch(facecolor=PALE, edgecolor=GRAY, hatch=HATCH, linewidth=0, label="surface")]
     arrow: dict[str, Any] = {"linestyle": "", "marker": r"$\rightarrow$", "markersize": 11, "color": VERMILLION}

@@ -8,10 +8,9 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D
 
-from impact_posture.output.plot.style import text_width
+from impact_posture.output.plot.style import SMALL, TINY, text_width
 from impact_posture.system.arrays import Array
 
-_TICKS = 6.5
 # No ticks within this share of the axis length at both ends, where two axes meet.
 _CORNER = 0.07
 
@@ -37,8 +36,8 @@ def frame_space(axes: Any, low: Array, high: Array, unit: str, bins: int, *, azi
         # In a cube, matplotlib centers numbers 8 points and names 21 points from their axis.  In a flat box, these
         # distances are smaller.
         scale = max(float(np.delete(size, k).mean() / size.max()), 0.25)
-        axes.tick_params(axis=name, pad=(8 if name == "z" else 6) / scale - 8, labelsize=_TICKS)
-        getattr(axes, f"set_{name}label")(f"{name}  [{unit}]", labelpad=(longest / 2 + 4) / scale - 13, fontsize=7.0)
+        axes.tick_params(axis=name, pad=(8 if name == "z" else 6) / scale - 8, labelsize=TINY)
+        getattr(axes, f"set_{name}label")(f"{name}  [{unit}]", labelpad=(longest / 2 + 4) / scale - 13, size=SMALL)
 
 
 def _set_ticks(axis: Any, low: float, high: float, bins: int, room: float) -> float:
@@ -48,7 +47,7 @@ def _set_ticks(axis: Any, low: float, high: float, bins: int, room: float) -> fl
         ticks = np.asarray(MaxNLocator(count, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high))
         ticks = ticks[(low + air <= ticks) & (ticks <= high - air)]
         axis.set_ticks(ticks)
-        longest = max((text_width(t, _TICKS) for t in axis.get_major_formatter().format_ticks(ticks)), default=0.0)
+        longest = max((text_width(t, TINY) for t in axis.get_major_formatter().format_ticks(ticks)), default=0.0)
         if len(ticks) * longest <= room or len(ticks) < 2:
             break
     return longest

@@ -41,23 +41,31 @@ WORST_BEFORE: dict[str, Any] = {"color": VERMILLION, "linestyle": (0, (3, 1.5)),
 WORST_AFTER: dict[str, Any] = {"color": BLUE, "linestyle": "-", "linewidth": 1.1}
 BEFORE_BAR: dict[str, Any] = {"facecolor": "#fbe3d3", "edgecolor": VERMILLION, "hatch": "//////", "linewidth": 0.6}
 AFTER_BAR: dict[str, Any] = {"facecolor": BLUE, "edgecolor": BLUE, "linewidth": 0.6}
+# Windows of runs; their two colors also differ in a gray print.
+SHADES: dict[str, dict[str, Any]] = {
+    "dwell": {"facecolor": "#f0f0f0", "edgecolor": "none", "zorder": 0.1},
+    "impact": {"facecolor": "#edc3d6", "edgecolor": "none", "zorder": 0.2},
+}
+# The range of commands, and the robot at the start of a run.
+BAND: dict[str, Any] = {"facecolor": "#dcdcdc", "edgecolor": "none", "zorder": 1.2}
+START: dict[str, Any] = {"color": "#a9a9a9", "linestyle": "-", "linewidth": 1.0, "zorder": 2.0}
 
 FORMATS = ("png", "svg", "pdf")
 # A PDF takes as long as three PNG files.
 DEFAULT_FORMATS = ("png",)
 # Width of a two-column page, inches.
 WIDTH = 7.2
-_SMALL = 7.0
+# Font sizes, points: text, legends, small print and tick numbers, and tick numbers in 3-D.
+TEXT, LEGEND, SMALL, TINY = 8.0, 7.5, 7.0, 6.5
 _LONGEST_TITLE = 85
 _LINE = 0.15
 _RC: dict[str, Any] = {
     "font.family": "DejaVu Sans",
-    "font.size": 8.0,
+    "font.size": TEXT,
     "axes.titlesize": 8.5,
-    "axes.labelsize": 8.0,
-    "xtick.labelsize": 7.0,
-    "ytick.labelsize": 7.0,
-    "legend.fontsize": 7.5,
+    "xtick.labelsize": SMALL,
+    "ytick.labelsize": SMALL,
+    "legend.fontsize": LEGEND,
     "axes.linewidth": 0.7,
     "axes.grid": False,
     "axes.axisbelow": True,
@@ -105,7 +113,7 @@ def framed(
         figure = Figure(figsize=(WIDTH, head + height + foot), layout="constrained")
         parts: Any = figure.subfigures(3, 1, height_ratios=[head, height, foot])
         top, body, bottom = parts
-        look = {"fontsize": _SMALL, "va": "top", "linespacing": 1.4}
+        look = {"fontsize": SMALL, "va": "top", "linespacing": 1.4}
         top.text(0.012, 1 - 0.06 / head, title, fontsize=10, fontweight="bold", va="top", parse_math=False)
         top.text(0.012, 1 - 0.26 / head, "\n".join(small), parse_math=False, **look)
         bottom.text(0.012, 1, "\n".join(below), color="#333333", **look)
@@ -117,7 +125,7 @@ def wrap(line: str, separator: str) -> list[str]:
     parts, room, used = [""], 72 * WIDTH * 0.975, 0.0
     for piece in line.split(separator):
         # Measure each piece with its separator, because the cache of ``text_width`` contains most of these texts.
-        width = text_width(f"{separator}{piece}".replace("$", ""), _SMALL)
+        width = text_width(f"{separator}{piece}".replace("$", ""), SMALL)
         if parts[-1] and used + width > room:
             parts.append("")
             used = 0.0
@@ -135,7 +143,7 @@ def text_width(text: str, size: float) -> float:
 
 def shared_legend(body: Any, handles: Sequence[Any], place: str) -> None:
     """Put the legend of a figure above (``upper``) or below (``lower``) its panels, across the page."""
-    size, handle, gap, room = float(_RC["legend.fontsize"]), 2.2, 1.4, 72 * WIDTH * 0.96
+    size, handle, gap, room = LEGEND, 2.2, 1.4, 72 * WIDTH * 0.96
     widths = [text_width(str(h.get_label()).replace("$", ""), size) + size * (handle + 0.8 + gap) for h in handles]
 
     def width(columns: int) -> float:
