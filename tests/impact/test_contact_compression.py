@@ -12,6 +12,7 @@ import scipy.integrate
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from impact_posture.codegen.export import export
 from impact_posture.config.problem_settings import MATERIALS
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import InputError, SpecError
@@ -339,3 +340,29 @@ def test_the_commands(tmp_path: Path) -> None:
     again = read_settings(out / "problem.toml")
     assert (again.contact_stiffness, again.max_force, again.max_joint_jump) == (1e5, 180, 3)
     assert (again.tradeoff, again.tradeoff_against) == (2, "force")
+
+
+def test_x_is_unknown_if_the_impact_moves_joints_on_unknown_springs(tmp_path: Path) -> None:
+    """Of talos, only the stiffness of the hip roll is known.  A hit on the hand hardly moves the hips."""
+    loaded = robot("talos")
+    objective = WorstCaseObjective(
+        loaded, ImpactContact("gripper_right_base_link", (-1, 0, 0)), supports=loaded.spec.supports
+    )
+    evaluation = evaluate(objective, loaded.posture(), contact_stiffness=ContactStiffness(linear=1e5))
+    squeezed = evaluation.compression
+    assert squeezed is not None and squeezed.x is None and squeezed.fitting is None
+    assert "arm_right_4_joint" in squeezed.unknown_springs and "leg_left_2_joint" not in squeezed.unknown_springs
+    # Every named joint moves more than a tenth of the fastest one, with the links alone.
+    links = WorstCaseObjective(with_joint_model(loaded, "link"), objective.contact, supports=loaded.spec.supports)
+    jump = np.abs(links.oracle.quantities(loaded.posture()).jump[6:])
+    sizes = dict(zip(loaded.tangent_names[6:], jump, strict=True))
+    assert all(sizes[name] >= 0.1 * jump.max() for name in squeezed.unknown_springs)
+    (warning,) = (line for line in evaluation.warnings if line.startswith("x is unknown"))
+    for name in ("link", "reflected"):
+        value = replace(objective, robot=with_joint_model(loaded, name)).value(loaded.posture())  # type: ignore[arg-type]
+        assert f"{value:.4g} with '{name}'" in warning
+    # The comment in the C header says the same.
+    (tmp_path / "c").mkdir()
+    export(objective, tmp_path / "c", compression=squeezed, check=False)
+    (header,) = (path for path in (tmp_path / "c").glob("*.h") if "arm_right_4_joint" in path.read_text())
+    assert "x is unknown" in header.read_text()

@@ -31,13 +31,15 @@ from impact_posture.impact.friction.coulomb_impact import coulomb_impact
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.quantities.impact_oracle import ImpactOracle
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
-from impact_posture.robot.joint_model import with_joint_model
+from impact_posture.robot.joint_model import transmissions, with_joint_model
 from impact_posture.system.arrays import Array
 
 # The integral ∫₀¹ dz/√(1 − z^{5/2}) is the ratio of T to δ/v for the force κδ^{3/2}.
 HERTZ_TIME = sqrt(pi) * gamma(7 / 5) / gamma(9 / 10)
 # Radius of the steel tip on the robot, m; a contact given by a material assumes this tip.
 TIP_RADIUS = 0.01
+# A joint whose jump is below this share of the largest jump of a joint does not determine x.
+_MOVED = 0.1
 # For x up to SHORT, only the links respond.  For x from LONG, the rotors respond too (docs: which inertia).
 SHORT, LONG = 0.2, 0.75
 
@@ -141,6 +143,8 @@ class Compression:
         by_material: Name of a material → x for a contact with this material; empty unless the springs are known and
             the contact is not.
         joint_model: The joint model of the objective.
+        unknown_springs: Joints that the impact moves and whose springs are unknown, although other springs are known.
+            Then x is unknown.
     """
 
     contact: ContactStiffness | None
@@ -150,6 +154,7 @@ class Compression:
     x: float | None
     by_material: dict[str, float]
     joint_model: JointModel
+    unknown_springs: tuple[str, ...] = ()
 
     @property
     def fitting(self) -> JointModel | None:
@@ -164,6 +169,9 @@ class Compression:
     @property
     def line(self) -> str:
         """Explanation of x for users; empty if x is not known."""
+        if self.unknown_springs:
+            joints = ", ".join(self.unknown_springs)
+            return f"x is unknown: the impact moves {joints}, whose stiffness robot.toml does not state"
         if self.x is None:
             if not self.by_material:
                 return ""
@@ -188,6 +196,7 @@ class Compression:
             "peak_force": self.peak_force,
             "x": self.x,
             "x_by_material": self.by_material,
+            "unknown_springs": list(self.unknown_springs),
             "fitting_joint_model": self.fitting,
             "line": self.line,
         }
@@ -205,12 +214,13 @@ def compression(
     springs, mass = springs_along(objective.case, q), contact_mass(objective.oracle, q)
     if (contact is None and springs is None) or mass is None:
         return None
+    unknown = unknown_springs(objective.case, q) if springs is not None else ()
     time = force = x = None
     by_material: dict[str, float] = {}
     if contact is not None:
         numbers = contact.compression_time(mass, speed), contact.peak_force(mass, speed)
         time, force = (value if np.isfinite(value) else None for value in numbers)
-    if springs is not None:
+    if springs is not None and not unknown:
         links, C = springs
         if contact is not None:
             x = contact.compression_time(links, speed) / sqrt(links * C)
@@ -221,7 +231,7 @@ def compression(
             }
     if x is not None and not np.isfinite(x):
         x = None
-    return Compression(contact, mass, time, force, x, by_material, objective.robot.joint_model)
+    return Compression(contact, mass, time, force, x, by_material, objective.robot.joint_model, unknown)
 
 
 def contact_mass(oracle: ImpactOracle, q: Array) -> float | None:
@@ -249,6 +259,20 @@ def springs_along(case: ImpactCase, q: Array) -> tuple[float, float] | None:
         return None
     mass = contact_mass(ImpactOracle(replace(case, robot=with_joint_model(case.robot, "link"))), q)
     return None if mass is None or compliance <= 0 else (mass, compliance)
+
+
+def unknown_springs(case: ImpactCase, q: Array) -> tuple[str, ...]:
+    """Return the joints that the impact moves and that have a rotor behind a spring of unknown stiffness.
+
+    A joint counts if its jump with the links alone is at least :data:`_MOVED` of the largest jump of a joint.
+    """
+    robot, table = case.robot, transmissions(case.robot)
+    joints = np.arange(robot.nv) >= (6 if robot.floating else 0)
+    jump = ImpactOracle(replace(case, robot=with_joint_model(robot, "link"))).quantities(q).jump
+    sizes = np.where(joints, np.abs(jump), 0.0)
+    springless = joints & ~table.rigid & ~table.locked & ~table.elastic & (robot.armature > 0)
+    moved = np.flatnonzero(springless & (sizes >= _MOVED * sizes.max(initial=0.0)) & (sizes > 0))
+    return tuple(robot.tangent_names[k] for k in moved[np.argsort(-sizes[moved])])
 
 
 def both_models(objective: WorstCaseObjective) -> dict[JointModel, WorstCaseObjective]:

@@ -250,7 +250,7 @@ def _elastic(
 
 def _joint_model_warning(objective: WorstCaseObjective, q: Array, squeezed: Compression | None) -> tuple[str, ...]:
     """If the joint model is not accurate for x, return a warning with the objective of both rigid joint models."""
-    if squeezed is None or squeezed.x is None:
+    if squeezed is None or (squeezed.x is None and not squeezed.unknown_springs):
         return ()
     if objective.robot.joint_model in (squeezed.fitting, "locked", "elastic"):
         return ()

@@ -199,8 +199,11 @@ def _better_objective(impact: ResolvedImpact, outcome: str, jumps: tuple[Jump, J
 def _other_joint_model(impact: ResolvedImpact, before: Evaluation, after: Evaluation) -> Iterator[str]:
     """Yield the change of the jump for each joint model that is more accurate than the chosen joint model."""
     chosen, compression = impact.robot.joint_model, after.compression
-    if compression is None or compression.x is None or chosen in (compression.fitting, "locked", "elastic"):
+    if compression is None or chosen in (compression.fitting, "locked", "elastic"):
         return
+    if compression.x is None and not compression.unknown_springs:
+        return
+    x = "x is unknown" if compression.x is None else f"x = {compression.x:.2g}"
     rebound = (1 + impact.restitution) * impact.speed
     for name, objective in both_models(impact.objective).items():
         if name == chosen or compression.fitting not in (None, name):
@@ -208,4 +211,4 @@ def _other_joint_model(impact: ResolvedImpact, before: Evaluation, after: Evalua
         jumps = [coulomb_jump(objective, evaluation.q, rebound) for evaluation in (before, after)]
         if jumps[0] is not None and jumps[1] is not None:
             change = in_words(relative_change(jumps[0].norm, jumps[1].norm))
-            yield f"with joint model '{name}' (x = {compression.x:.2g}) the jump {change}"
+            yield f"with joint model '{name}' ({x}) the jump {change}"
