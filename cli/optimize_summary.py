@@ -41,7 +41,7 @@ def announce(page: Page, prepared: Prepared) -> None:
         page.line(f"  {line}")
     for note in problem.notes:
         page.line(f"  ({note})", style="dim")
-    page.warnings(impact.warnings)
+    page.warnings(prepared.warnings)
     page.gap()
 
 
@@ -84,7 +84,9 @@ def summarize(page: Page, prepared: Prepared, solution: PostureSolution, documen
     )
     if "collision" in document:
         at = document["collision"]["optimal"]
-        page.line(f"no collision; closest: {at['closest']}, {1e3 * at['distance']:.3g} mm")
+        bare = len(document["collision"]["links_without_shapes"])
+        among = f" among the links that have shapes ({bare} ha{'ve' if bare > 1 else 's'} none)" if bare else ""
+        page.line(f"no collision{among}; closest: {at['closest']}, {1e3 * at['distance']:.3g} mm")
     # Count optima by their printed value, because mirrored postures have equal values.
     hits = Counter[str]()
     for optimum in solution.optima:
@@ -103,8 +105,8 @@ def summarize(page: Page, prepared: Prepared, solution: PostureSolution, documen
         _tradeoff(page, document, [n for n in document["notes"] if n.startswith("trade-off:")])
     if "path" in document:
         _path(page, document["path"])
-    # The warnings of the robot were printed before the solver started.
-    page.warnings(document["warnings"][len(prepared.impact.warnings) :])
+    # The first warnings were printed before the solver started.
+    page.warnings(document["warnings"][len(prepared.warnings) :])
 
 
 def _holding(page: Page, before: dict[str, Any] | None, after: dict[str, Any] | None) -> None:

@@ -35,6 +35,7 @@ def inspect(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
+    from impact_posture.collision.robot_shapes import shape_warnings
     from impact_posture.robot.robot_loader import load_robot
     from impact_posture.robot.robot_summary import summarize
 
@@ -44,7 +45,10 @@ def inspect(
             raise UsageError("--config contradicts --write-robot-toml, which writes a new robot.toml: leave it out.")
         _write(page, robot, load, write_robot_toml, force=force)
         return
-    summary = summarize(load_robot(robot, load))
+    with page.progress("reading the shapes"):
+        loaded = load_robot(robot, load)
+        summary = summarize(loaded)
+        summary["warnings"] += shape_warnings(loaded)
     if json:
         print_json(summary)
         return

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache, partial
 
@@ -16,10 +17,13 @@ from impact_posture.collision.shape_pairs import Pair, mostly_touching, nested_p
 from impact_posture.collision.swept_hull import Fit, SweptHull, fit_hull
 from impact_posture.collision.urdf_shapes import UrdfShape, read_urdf_shapes
 from impact_posture.config.cached_values import StoredArray, read_stored, write_stored
+from impact_posture.errors import one_line
 from impact_posture.robot.robot import Robot
 from impact_posture.system.progress import tell
 
 NO_SHAPES = "the robot has no shapes, so nothing keeps its links apart; joint origins are checked at the end"
+# Largest number of links that a warning names.
+_MOST_NAMED = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +37,7 @@ class FittedShapes:
             These shapes overlap by design, so their contact is allowed.
         joint_planes: Bounds on joints for nested bodies (:func:`nested_pairs`), which ``pairs`` leaves out.
         hulls_touching: Names of nested bodies without such bounds.  Only :class:`MeshCheck` detects their collisions.
+        links: Links whose shapes are used.
         warnings: Warnings about shapes, one line each.
     """
 
@@ -41,19 +46,25 @@ class FittedShapes:
     always_touching: tuple[tuple[str, str], ...]
     joint_planes: tuple[JointPlanes, ...]
     hulls_touching: tuple[tuple[str, str], ...]
+    links: tuple[str, ...]
     warnings: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class RobotShapes(FittedShapes):
-    """Collision shapes with their robot, which loads the shapes of the URDF on demand."""
+    """Collision shapes with their robot, which loads the shapes of the URDF on demand.
+
+    ``without_shapes`` names each link none of whose shapes can be used, and the first link of each joint that moves a
+    mass but no shape.
+    """
 
     robot: Robot
+    without_shapes: tuple[str, ...]
 
     @cached_property
     def geometry(self) -> pin.GeometryModel:
         """The shapes of the URDF, with the pairs that must not touch."""
-        loaded = load_geometry(self.robot, read_urdf_shapes(self.robot)[0])
+        loaded = load_geometry(self.robot, read_urdf_shapes(self.robot).shapes)
         names = [shape.name for shape in loaded.model.geometryObjects]
         touching = set(self.always_touching)
         for i, j in pairs_of(loaded.apart):
@@ -64,12 +75,68 @@ class RobotShapes(FittedShapes):
 
 @dataclass(frozen=True)
 class _Source:
-    """Argument of :func:`_shapes`.  Sources with equal keys and warnings have equal shapes."""
+    """Argument of :func:`_shapes`.  Sources with equal keys and warnings have equal shapes.
+
+    ``links`` are the links for which the URDF describes shapes.
+    """
 
     key: str
     robot: Robot = field(compare=False)
     described: list[UrdfShape] = field(compare=False)
     warnings: tuple[str, ...]
+    links: tuple[str, ...]
+
+    def without_shapes(self, used: Collection[str]) -> tuple[str, ...]:
+        """Return :attr:`RobotShapes.without_shapes` if the shapes of the links ``used`` are used."""
+        model, bare = self.robot.model, list[str]()
+        frames = [frame for frame in model.frames if frame.type == pin.FrameType.BODY]
+        covered = {0, *(int(frame.parentJoint) for frame in frames if frame.name in used)}
+        for frame in frames:
+            joint = int(frame.parentJoint)
+            alone = joint not in covered and model.inertias[joint].mass > 0
+            if frame.name not in used and (frame.name in self.links or alone):
+                bare.append(str(frame.name))
+                covered.add(joint)
+        return tuple(bare)
+
+    def all_warnings(self, used: Collection[str], warnings: Iterable[str]) -> tuple[str, ...]:
+        """Return all warnings if the shapes of the links ``used`` are used and loading them gave ``warnings``."""
+        words, bare = [] if used else [NO_SHAPES], self.without_shapes(used)
+        if used and bare:
+            more = f" and {len(bare) - _MOST_NAMED} more" if len(bare) > _MOST_NAMED else ""
+            named = f"links without shapes: {', '.join(bare[:_MOST_NAMED])}{more}"
+            words = [one_line(f"{named}; nothing keeps them from a collision, and only their origins are checked")]
+        return (*self.warnings, *warnings, *words)
+
+
+@dataclass(frozen=True)
+class _LoadedShapes:
+    """Links whose shapes can be used, and warnings of loading them, as the cache stores them."""
+
+    links: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+
+def _source(robot: Robot) -> _Source:
+    read = read_urdf_shapes(robot)
+    key = geometry_key(robot, read.shapes)
+    return _Source(key, robot, read.shapes, tuple(read.warnings), tuple(read.described))
+
+
+def shape_warnings(robot: Robot) -> tuple[str, ...]:
+    """Return the warnings of :func:`load_shapes`, without the hulls, which take longer.
+
+    Raises:
+        UrdfError: As in :func:`load_shapes`.
+    """
+    source = _source(robot)
+    loaded = read_stored("loaded-shapes", source.key, _LoadedShapes)
+    if loaded is None:
+        tell("reading collision shapes")
+        geometry = load_geometry(robot, source.described)
+        loaded = _LoadedShapes(tuple(dict.fromkeys(geometry.links)), geometry.warnings)
+        write_stored("loaded-shapes", source.key, loaded)
+    return source.all_warnings(loaded.links, loaded.warnings)
 
 
 @lru_cache(maxsize=16)
@@ -78,8 +145,7 @@ def load_shapes(robot: Robot) -> RobotShapes:
 
     The result is cached in memory and on disk; the key is a hash of the URDF and its meshes.
     """
-    described, warnings = read_urdf_shapes(robot)
-    return _shapes(_Source(geometry_key(robot, described), robot, described, tuple(warnings)))
+    return _shapes(_source(robot))
 
 
 @lru_cache(maxsize=16)
@@ -88,8 +154,8 @@ def _shapes(source: _Source) -> RobotShapes:
     if fitted is None:
         fitted = fit_shapes(source.robot, source.described)
         write_stored("shapes", source.key, fitted)
-    warnings = (*source.warnings, *fitted.warnings, *(() if fitted.bodies else (NO_SHAPES,)))
-    return RobotShapes(**vars(fitted) | {"warnings": warnings}, robot=source.robot)
+    warnings, bare = source.all_warnings(fitted.links, fitted.warnings), source.without_shapes(fitted.links)
+    return RobotShapes(**vars(fitted) | {"warnings": warnings}, robot=source.robot, without_shapes=bare)
 
 
 def fit_shapes(robot: Robot, described: list[UrdfShape]) -> FittedShapes:
@@ -123,6 +189,7 @@ def fit_shapes(robot: Robot, described: list[UrdfShape]) -> FittedShapes:
         always_touching=tuple((shapes[i].name, shapes[j].name) for i, j in touching),
         hulls_touching=tuple(names for names, bounds in planes.items() if bounds is None),
         joint_planes=tuple(bounds for bounds in planes.values() if bounds is not None),
+        links=tuple(dict.fromkeys(loaded.links)),
         warnings=loaded.warnings,
     )
 

@@ -9,6 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 from urllib.parse import unquote
 
 import coal
@@ -36,6 +37,20 @@ _SIZES = {
     "capsule": {"radius": 1, "length": 1},
     "mesh": {"scale": 3},
 }
+
+
+class UrdfShapes(NamedTuple):
+    """The shapes in a URDF.
+
+    Attributes:
+        shapes: Shapes whose description can be used.
+        warnings: A warning for each other shape.
+        described: Links for which the URDF describes a shape, even if no shape of the link can be used.
+    """
+
+    shapes: list[UrdfShape]
+    warnings: list[str]
+    described: list[str]
 
 
 class UnusableShape(Exception):
@@ -110,8 +125,8 @@ def largest_extent(robot: Robot) -> float:
     return max(_LARGEST, _LARGEST_SHARE * float(np.linalg.norm(np.ptp(np.array(points), axis=0))))
 
 
-def read_urdf_shapes(robot: Robot, first: str = "collision") -> tuple[list[UrdfShape], list[str]]:
-    """Return the shapes in the URDF of a robot, and a warning for each shape that is left out.
+def read_urdf_shapes(robot: Robot, first: str = "collision") -> UrdfShapes:
+    """Read the shapes in the URDF of a robot.
 
     If a link has both ``collision`` and ``visual`` shapes, the shapes ``first`` are used.
 
@@ -119,12 +134,12 @@ def read_urdf_shapes(robot: Robot, first: str = "collision") -> tuple[list[UrdfS
         UrdfError: The URDF has become unreadable, or its links differ from the links of the robot.
     """
     if robot.settings is None:
-        return [], []
+        return UrdfShapes([], [], [])
     located = locate(robot.settings.robot, robot.settings)
     folders = [Path(folder).expanduser() for folder in robot.settings.package_dir]
     folders += [located.folder / Path(folder).expanduser() for folder in located.spec.model.package_dirs]
     folders += [Path(folder) for folder in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if folder]
-    shapes, warnings = [], []
+    read = UrdfShapes([], [], [])
     root = parse_urdf(located.urdf)
     colors = {tag.get("name", ""): tag for tag in root.findall("material")}
     for link in root.iter("link"):
@@ -132,13 +147,15 @@ def read_urdf_shapes(robot: Robot, first: str = "collision") -> tuple[list[UrdfS
         if not robot.model.existFrame(name, pin.FrameType.BODY):
             raise UrdfError("has changed since the robot was loaded", where=str(located.urdf), hint="load it again")
         tags = link.findall(first) or link.findall("visual") or link.findall("collision")
+        if tags:
+            read.described.append(name)
         for k, tag in enumerate(tags):
             unique = name if len(tags) == 1 else f"{name}[{k}]"
             try:
-                shapes.append(_read(tag, unique, name, located.urdf, folders, colors))
+                read.shapes.append(_read(tag, unique, name, located.urdf, folders, colors))
             except UnusableShape as fault:
-                warnings.append(left_out(unique, fault))
-    return shapes, warnings
+                read.warnings.append(left_out(unique, fault))
+    return read
 
 
 def left_out(name: str, fault: UnusableShape) -> str:

@@ -136,14 +136,16 @@ def test_a_bad_description_is_left_out_by_name(tmp_path: Path, geometry: str, fa
     robot = load_robot(str(urdf), armature="none")
     # Add the invalid shape after the robot is loaded, because some Pinocchio versions cannot read such shapes.
     urdf.write_text(text.replace(link("middle", BOX), link("middle", geometry)))
-    shapes, (line,) = read_urdf_shapes(robot)
-    assert [shape.name for shape in shapes] == ["base"]
+    shapes, (line,), links = read_urdf_shapes(robot)
+    assert [shape.name for shape in shapes] == ["base"] and links == ["base", "middle"]
     assert line.startswith("shape middle is left out: ") and fault in line
 
 
 def test_a_ball_of_millimeters_is_left_out(tmp_path: Path) -> None:
     shapes = arm(tmp_path, '<sphere radius="50"/>')
-    assert shapes.warnings == ("shape middle is left out: its <sphere> has a size of 50 m; give sizes in meters",)
+    size, bare = shapes.warnings
+    assert size == "shape middle is left out: its <sphere> has a size of 50 m; give sizes in meters"
+    assert bare.startswith("links without shapes: middle; ") and shapes.without_shapes == ("middle",)
 
 
 def test_files_that_change_after_loading_are_one_line(tmp_path: Path) -> None:

@@ -128,7 +128,7 @@ def draw_robot(robot: Robot, meshes: bool = False) -> DrawnRobot:
 
     A robot without shapes gets sticks.  If ``meshes`` is true, the user permits copies of all meshes.
     """
-    described, warnings = read_urdf_shapes(robot, "visual")
+    described, warnings, _ = read_urdf_shapes(robot, "visual")
     by_name = {shape.name: shape for shape in described}
     known = {shape.name: license_of(shape.mesh) for shape in described if shape.mesh is not None}
     hulls = {name for name, terms in known.items() if not (meshes or (terms and terms.allows))}

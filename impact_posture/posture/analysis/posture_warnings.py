@@ -6,9 +6,10 @@ from impact_posture.dynamics.numeric import Numeric
 from impact_posture.impact.impact_contact import point_on
 from impact_posture.posture.formulation.problem_file import Prepared
 from impact_posture.posture.loads.holding_forces import HoldingForces
+from impact_posture.robot.model_joints import rigid_groups
 from impact_posture.system.arrays import Array
 
-# Joints farther than this (m) behind a surface or below the ground are reported.
+# Origins of joints or links farther than this (m) behind a surface or below the ground are reported.
 _BEHIND = 0.01
 
 
@@ -25,18 +26,16 @@ def posture_warnings(prepared: Prepared, initial: Array, q: Array, holding: Hold
             f"in the optimal posture, {touch.fact}: give `offset` {touch.offset}, or `contact_pose` full"
             for touch in prepared.impact.early_touches(q)
         ]
-    around = prepared.problem.surroundings
-    if around is not None and around.shapes.bodies:
-        return held
     return [*held, *_surface_warnings(prepared, initial, q), *_ground_warnings(prepared, q)]
 
 
 def _surface_warnings(prepared: Prepared, initial: Array, q: Array) -> list[str]:
-    """Warn about joints that lie behind the contact plane; no constraint keeps them in front of it."""
+    """Warn about joints or links that lie behind the contact plane; no constraint keeps them in front of it."""
+    requirements = prepared.problem.requirements
     # With a free contact pose, an object pushes the robot, so there is no surface.
-    if prepared.problem.requirements.contact_pose == "free":
+    if requirements.contact_pose == "free" or requirements.surface == "none":
         return []
-    before, after = (_joints_behind(prepared, posture) for posture in (initial, q))
+    before, after = (_behind(prepared, posture) for posture in (initial, q))
     lines = []
     if before:
         lines.append(
@@ -52,20 +51,21 @@ def _surface_warnings(prepared: Prepared, initial: Array, q: Array) -> list[str]
     return lines
 
 
-def _joints_behind(prepared: Prepared, q: Array) -> list[str]:
-    """Return the joints whose origins lie behind the contact plane, except the joint of the contact link."""
-    oracle = prepared.impact.objective.oracle.at(q)
-    contact = oracle.numeric.placement(oracle.point).translation
-    n, touching = oracle.n.copy(), oracle.point.joint
+def _behind(prepared: Prepared, q: Array) -> list[str]:
+    """Return what lies behind the contact plane, except what moves with the contact link."""
+    oracle, around = prepared.impact.objective.oracle.at(q), prepared.problem.surroundings
+    contact, n = oracle.numeric.placement(oracle.point).translation, oracle.n.copy()
+    depth = around.depth(prepared.impact.contact) if around else 0.0
+    group = rigid_groups(prepared.impact.robot.model, prepared.problem.requirements.hold)
     return [
         name
         for joint, name, origin in _origins(prepared, oracle.numeric)
-        if joint != touching and n @ (origin - contact) < -_BEHIND
+        if group[joint] != group[oracle.point.joint] and n @ (origin - contact) < -depth - _BEHIND
     ]
 
 
 def _ground_warnings(prepared: Prepared, q: Array) -> list[str]:
-    """Warn about joints that lie below the lowest foot; no constraint keeps them above flat ground."""
+    """Warn about joints or links that lie below the lowest foot; no constraint keeps them above flat ground."""
     robot, supports = prepared.impact.robot, prepared.impact.supports
     if not supports:
         return []
@@ -80,13 +80,19 @@ def _ground_warnings(prepared: Prepared, q: Array) -> list[str]:
 
 
 def _origins(prepared: Prepared, numeric: Numeric) -> list[tuple[int, str, Array]]:
-    """Return the index, name and world origin of every joint at the posture of ``numeric``."""
-    model = prepared.impact.robot.model
-    return [
-        (i, "the base" if model.names[i] == "root_joint" else str(model.names[i]), numeric.data.oMi[i].translation)
-        for i in range(1, model.njoints)
-    ]
+    """Return joint index, name and world origin of all that no collision constraint keeps apart at a posture.
+
+    These are the links without shapes, or all joints if no link has a shape or there are no collision constraints.
+    """
+    robot, around = prepared.impact.robot, prepared.problem.surroundings
+    if around is not None and around.shapes.bodies:
+        frames = [robot.model.frames[robot.frame_id(link)] for link in around.shapes.without_shapes]
+        joints = [int(frame.parentJoint) for frame in frames]
+        placed = zip(joints, frames, strict=True)
+        return [(k, f"link {f.name}", (numeric.data.oMi[k] * f.placement).translation) for k, f in placed if k > 0]
+    names = ["the base" if name == "root_joint" else str(name) for name in robot.model.names]
+    return [(k, names[k], numeric.data.oMi[k].translation) for k in range(1, robot.model.njoints)]
 
 
 def _named(names: list[str]) -> str:
-    return ", ".join(names[:3]) + (f" and {len(names) - 3} more joints" if len(names) > 3 else "")
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")

@@ -52,7 +52,7 @@ def result_document(
     attainable = [approach.reached(q) for q in (solution.initial, solution.q)]
     fault = [solution.compiler_fault] if solution.compiler_fault else []
     at_posture = posture_warnings(prepared, solution.initial, solution.q, after)
-    warnings = (*impact.warnings, *initial.warnings, *optimal.warnings, *fault, *at_posture)
+    warnings = (*prepared.warnings, *initial.warnings, *optimal.warnings, *fault, *at_posture)
     curve = {} if tradeoff is None else {"tradeoff": tradeoff.to_list(), "tradeoff_against": tradeoff.against}
     return {
         "schema": SCHEMA,

@@ -58,7 +58,7 @@ class Surroundings:
         self._walls: list[_Wall] = []
         self._still = {0}
         self._depths: dict[ImpactContact, float] = {}
-        self.notes: list[str] = list(self.shapes.warnings)
+        self.notes: list[str] = []
         if touching := self.shapes.always_touching:
             pairs = [*(" / ".join(pair) for pair in touching[:3]), *["…"] * (len(touching) > 3)]
             text = "pairs of shapes may touch, because they touch at the default posture and most others"
@@ -181,6 +181,7 @@ class Surroundings:
         shapes = self.shapes
         return {
             "shapes": len(shapes.bodies),
+            "links_without_shapes": list(shapes.without_shapes),
             "clearance": self._clearance,
             "always_touching": [list(pair) for pair in shapes.always_touching],
             "hulls_touching": [list(pair) for pair in shapes.hulls_touching],

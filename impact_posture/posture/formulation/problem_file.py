@@ -48,6 +48,12 @@ class Prepared:
     impact: ResolvedImpact
     problem: ConstrainedProblem
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Warnings that are known before the search: about the robot, the objective, and the collision shapes."""
+        around = self.problem.surroundings
+        return tuple(dict.fromkeys((*self.impact.warnings, *(around.shapes.warnings if around else ()))))
+
 
 def read_settings(path: Path, over: dict[str, object] | None = None) -> ProblemSettings:
     """Read a ``problem.toml`` with paths relative to its folder; options in ``over`` replace keys of the file."""
