@@ -107,10 +107,10 @@ class Page:
             table.add_row(*[Text(printable(cell)) for cell in row])
         self.console.print(table)
 
-    def warnings(self, lines: Iterable[str]) -> None:
-        """Write each warning as a line to standard error, unless the page is quiet."""
+    def warnings(self, lines: Iterable[str | None]) -> None:
+        """Write each warning that is not empty as a line to standard error, unless the page is quiet."""
         if not self.quiet:
-            for line in lines:
+            for line in filter(None, lines):
                 complain(f"warning: {as_options(line)}")
 
 

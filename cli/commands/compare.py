@@ -59,8 +59,7 @@ def compare(
         if folder is not None and store is not None:
             output = Output(folder, force, format or FORMATS, not no_report, meshes)
             failure = write_comparison(output, reproduction, store)
-    if failure:
-        page.warnings([f"there is no report.html: {failure}"])
+    page.warnings([failure and f"there is no report.html: {failure}"])
     if json:
         print_json(reproduction.comparison())
         return

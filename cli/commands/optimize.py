@@ -97,10 +97,9 @@ def optimize(
             jobs=jobs,
             progress=advance,
         )
-    if written.compiler_error:
-        page.warnings([f"the C code in c/ is written but could not be built: {written.compiler_error}"])
-    if written.report_error:
-        page.warnings([f"there is no report.html: {written.report_error}"])
+    bare, unreported = written.compiler_error, written.report_error
+    page.warnings([bare and f"the C code in c/ is written but could not be built: {bare}"])
+    page.warnings([unreported and f"there is no report.html: {unreported}"])
     if json:
         print_json(result.document)
     elif not quiet:

@@ -98,8 +98,7 @@ def simulate(
             runs, document = execute(job, factory)
         output = Output(folder, force, format or FORMATS, not no_report, meshes)
         failure = write_simulation(output, job, runs, document)
-    if failure:
-        page.warnings([f"there is no report.html: {failure}"])
+    page.warnings([failure and f"there is no report.html: {failure}"])
     if json:
         print_json(document)
     else:
@@ -165,9 +164,7 @@ def _show(page: Page, document: dict[str, Any], label: str, folder: Path, notes:
             which = f" (push {event['sign']:+d})" if len(runs) > 1 else ""
             page.line(f"  t = {event['time']:.2f} s: {event['status']}{which}: {event['what']}")
     page.gap()
-    for key, note in (("offline", "note"), ("path", "reason")):
-        if document[key] and document[key][note]:
-            notes.append(document[key][note])
+    notes += [document[key] and document[key][note] for key, note in (("offline", "note"), ("path", "reason"))]
     if document["metrics"] is not None and not document["metrics"]["rested"]:
         notes.append("the robot was not at rest before the push: the numbers include its own motion")
     page.warnings(notes)

@@ -68,9 +68,8 @@ def verify(
         )
         head = ("way", "", "largest error", "allowed", "", "where")
         page.table(head, [_cells(row) for row in report.rows], right=(2, 3), fold=5)
-        page.warnings(impact.warnings)
-        others = [contact.frame for contact in impact.objective.others]
-        page.warnings([f"{impact.contact.frame} alone is compared, not {', '.join(others)}"] if others else [])
+        others = ", ".join(contact.frame for contact in impact.objective.others)
+        page.warnings([*impact.warnings, others and f"{impact.contact.frame} alone is compared, not {others}"])
     if not report.passed:
         failed = [row for row in report.rows if row.verdict == "fail"]
         named = ", ".join(" ".join(filter(None, (row.source, row.quantity))) for row in failed)

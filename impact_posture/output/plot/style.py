@@ -67,7 +67,6 @@ _RC: dict[str, Any] = {
     "ytick.labelsize": SMALL,
     "legend.fontsize": LEGEND,
     "axes.linewidth": 0.7,
-    "axes.grid": False,
     "axes.axisbelow": True,
     # A fixed position of the title saves time: by default, matplotlib searches for ticks above every panel.
     "axes.titley": 1.0,
