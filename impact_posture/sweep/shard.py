@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from impact_posture.impact.evaluation.velocity_jump import normal_jump
 from impact_posture.posture.program.ipopt import one_blas_thread
 from impact_posture.sweep.case_solver import CaseSolver, kept
 from impact_posture.sweep.point_search import Place, PointResult, Start, Walk, improve, search
@@ -137,7 +138,7 @@ class _Shard:
         """Return the predicted impulse, predicted jump and attainable speed of a point."""
         choice = self._solver.normal_and_speed(values)
         impact = self._solver.template(*choice).impact
-        approach = (1 + impact.restitution) * impact.speed
+        approach = normal_jump(impact.speed, impact.restitution)
         return {
             "predicted_impulse": approach / row["G"],
             "predicted_jump": approach * row["V"] ** 0.5,

@@ -33,7 +33,7 @@ from impact_posture.impact.evaluation.objective_value import (
     variant_values,
     worst_variant,
 )
-from impact_posture.impact.evaluation.velocity_jump import Jump, frictionless_jump, sticking_jump
+from impact_posture.impact.evaluation.velocity_jump import Jump, frictionless_jump, normal_jump, sticking_jump
 from impact_posture.impact.friction.contact_stability import ContactStability, contact_stability
 from impact_posture.impact.impact_contact import LARGEST, point_on
 from impact_posture.impact.quantities.impact_oracle import ImpactOracle
@@ -176,7 +176,7 @@ def evaluate(
     robot, oracle = objective.robot, objective.oracle
     quantities = oracle.quantities(q)
     scalars = Scalars.of(quantities)
-    rebound = (1 + restitution) * speed
+    rebound = normal_jump(speed, restitution)
     without_supports, effect = _without_supports(objective, q, quantities.H)
     model_variants = variant_values(objective, q)
     member = objective.by_variant[worst_variant(model_variants)] if model_variants else objective

@@ -75,11 +75,15 @@ def merged_entries(
     ]
 
 
+def normal_jump(speed: float, restitution: float) -> float:
+    """Return ``(1+e) v_n``, by which the impact changes the normal velocity of the contact point, m/s."""
+    return (1 + restitution) * speed
+
+
 def frictionless_jump(objective: WorstCaseObjective, quantities: ImpactQuantities, rebound: float) -> Jump | None:
     """Return the jump ``Δν = (1+e) v_n a/G``, whose impulse along n is ``(1+e) v_n/G``.
 
-    ``rebound`` is ``(1+e) v_n`` with the coefficient of restitution e and the approach speed v_n, m/s.  Return
-    ``None`` if the contact cannot move along the normal.
+    ``rebound`` is :func:`normal_jump`, m/s.  Return ``None`` if the contact cannot move along the normal.
     """
     if quantities.blocked:
         return None

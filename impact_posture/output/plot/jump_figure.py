@@ -12,6 +12,7 @@ from matplotlib.patches import Patch
 
 from impact_posture.impact.evaluation.coulomb_jump import CoulombJump, coulomb_jump
 from impact_posture.impact.evaluation.impact_effect import tangent_units
+from impact_posture.impact.evaluation.velocity_jump import normal_jump
 from impact_posture.output.plot.result_view import ResultView, header_lines, jump_unit, number
 from impact_posture.output.plot.style import AFTER_BAR, BEFORE_BAR, INK, VERMILLION, framed, shared_legend
 from impact_posture.system.arrays import Array
@@ -28,7 +29,7 @@ def jump_figure(view: ResultView) -> Figure:
     separate panels.
     """
     groups = groups_of(view)
-    gain = (1 + view.restitution) * view.speed
+    gain = normal_jump(view.speed, view.restitution)
     states = (view.before, view.after)
     rubbed = [coulomb_jump(view.objective, q, gain) for q in (view.q_initial, view.q_optimal)]
     before, after = rubbed

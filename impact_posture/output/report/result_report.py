@@ -11,6 +11,7 @@ import numpy as np
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.impact.elasticity.contact_compression import contact_mass
 from impact_posture.impact.evaluation.coulomb_jump import coulomb_jump, coulomb_jumps
+from impact_posture.impact.evaluation.velocity_jump import normal_jump
 from impact_posture.impact.impact_contact import point_on
 from impact_posture.output.plot.result_view import ALONE, SEPARATOR, ResultView, header_lines, number
 from impact_posture.output.quantity_table import QuantityRow, quantities, quantity_rows
@@ -86,7 +87,7 @@ def _jumps(view: ResultView, postures: Array) -> tuple[Array, Array]:
     All contacts act at once if their common jump is defined, otherwise only the first contact.  If the impact is
     undefined, the jump is zero and the impulse is NaN.
     """
-    objective, rebound, together = view.objective, (1 + view.restitution) * view.speed, _together(view)
+    objective, rebound, together = view.objective, normal_jump(view.speed, view.restitution), _together(view)
     jumps = np.zeros((len(postures), objective.robot.nv))
     impulses = np.full((len(postures), len(objective.contacts)), np.nan)
     for k, q in enumerate(postures):

@@ -10,7 +10,7 @@ from impact_posture.config.json_block import json_block
 from impact_posture.impact.elasticity.contact_compression import both_models
 from impact_posture.impact.evaluation.coulomb_jump import CoulombJump, coulomb_jump
 from impact_posture.impact.evaluation.evaluation import Evaluation
-from impact_posture.impact.evaluation.velocity_jump import Jump
+from impact_posture.impact.evaluation.velocity_jump import Jump, normal_jump
 from impact_posture.impact.resolved_impact import ResolvedImpact
 from impact_posture.posture.analysis.verdict_changes import (
     SAME,
@@ -204,7 +204,7 @@ def _other_joint_model(impact: ResolvedImpact, before: Evaluation, after: Evalua
     if compression.x is None and not compression.unknown_springs:
         return
     x = "x is unknown" if compression.x is None else f"x = {compression.x:.2g}"
-    rebound = (1 + impact.restitution) * impact.speed
+    rebound = normal_jump(impact.speed, impact.restitution)
     for name, objective in both_models(impact.objective).items():
         if name == chosen or compression.fitting not in (None, name):
             continue

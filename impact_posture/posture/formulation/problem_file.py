@@ -13,6 +13,7 @@ from impact_posture.config.setting import stated
 from impact_posture.config.table_validation import read_toml, validate
 from impact_posture.errors import InputError, SpecError
 from impact_posture.impact.elasticity.contact_compression import ContactStiffness
+from impact_posture.impact.evaluation.velocity_jump import normal_jump
 from impact_posture.impact.objective import Objective
 from impact_posture.impact.resolved_impact import FLOATS, ResolvedImpact, held_by_default, resolve
 from impact_posture.posture.approach.approach_speed import ApproachSpeed
@@ -171,7 +172,7 @@ def _largest_jump(settings: ProblemSettings) -> float:
     jumps = [] if settings.max_joint_jump is None else [settings.max_joint_jump]
     if settings.max_torque is not None and settings.velocity_gain is not None:
         jumps.append(settings.max_torque / settings.velocity_gain)
-    speed = (1 + settings.restitution) * settings.speed
+    speed = normal_jump(settings.speed, settings.restitution)
     return min(jumps) / speed if jumps and speed > 0 else float("inf")
 
 
