@@ -308,5 +308,5 @@ def test_impulse_of_the_contact_text_and_the_default_offset() -> None:
     assert (
         resolve(ImpactSettings(robot="panda", contact=("panda_hand_tcp:0,0,2",), impulse=5.0)).contact.impulse == 5.0
     )
-    with pytest.raises(ContactError, match="instead of"):
+    with pytest.raises(ContactError, match="cannot be combined"):
         resolve(ImpactSettings(robot="panda", contact=("panda_hand_tcp:0,0,2",), normal=(0.0, 0.0, 1.0)))
