@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 JOBS ?= 2
 
-.PHONY: help demo test coverage wheel test-wheel lowest lint types docs bench study-impacts study-elastic study-global study-feasible study-flow study-robustness study-real-impacts study-scan study-controller study-sweep reproduction calibration regression
+.PHONY: help demo test coverage wheel test-wheel lowest lint types docs bench study-impacts study-elastic study-global study-feasible study-flow study-robustness study-real-impacts study-verdict study-scan study-controller study-sweep reproduction calibration regression
 .PHONY: pictures viewer clean
 
 help:
@@ -24,6 +24,7 @@ help:
 	@echo "make study-feasible  measure the effect of collision constraints, limits at rest and approach speed"
 	@echo "make study-flow     run the reference flow from 1,000 random starts for each of four seeds (three minutes)"
 	@echo "make study-real-impacts  compare the rigid model with MuJoCo for throws, strikes and taps (some minutes)"
+	@echo "make study-verdict  simulate the impacts of verdicts, and compare each number (some minutes)"
 	@echo "make study-robustness  measure where each controller helps and which targets it meets (ten minutes; can continue after an interruption)"
 	@echo "make study-scan     scan postures of an arm and of a humanoid, and draw the results"
 	@echo "make study-controller  compare the controllers in C and Python: equal answers, growth of memory, times (an hour; PART=equality, growth or times runs one part; times needs 4 minutes on a quiet machine)"
@@ -133,6 +134,9 @@ study-scan: $(VENV)/.installed-test
 
 study-real-impacts: $(VENV)/.installed-test
 	$(BIN)/python -m docs.studies real-impacts --jobs $(JOBS) --write
+
+study-verdict: $(VENV)/.installed-test
+	$(BIN)/python -m docs.studies verdict --jobs $(JOBS) --write
 
 calibration: $(VENV)/.installed-test
 	$(BIN)/python -m docs.studies restitution --write

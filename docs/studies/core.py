@@ -85,6 +85,13 @@ STUDIES = {
         Study("points", "robustness.study:points", "runs the points of the next two; random draws", 40, page=False),
         Study("robustness", "robustness.study", "where each controller helps", target="study-robustness"),
         Study("envelope", "robustness.study:kept_targets", "targets that are kept", target="study-robustness"),
+        Study(
+            "verdict",
+            "verdict.page",
+            "numbers of the verdict against simulated impacts; starts",
+            4,
+            target="study-verdict",
+        ),
         Study("scan", "scan", "a scan along the redundancy; postures of each robot", 11, target="study-scan"),
         Study("reproduction", "reproduction", "the experiments of the paper; seeds", 10, target="reproduction"),
     )

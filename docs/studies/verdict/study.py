@@ -1,0 +1,228 @@
+"""Simulate the impacts of verdicts, and compare each number."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from docs.studies.cases import AHEAD, ASIDE, BACK, DOWN
+from docs.studies.core import Vector
+from docs.studies.verdict.impact_simulation import ImpactSimulation, Point, Surface
+from impact_posture.config.problem_settings import ProblemSettings
+from impact_posture.config.table_validation import validate
+from impact_posture.impact.elasticity.contact_compression import ContactStiffness
+from impact_posture.impact.evaluation.evaluation import Evaluation
+from impact_posture.impact.friction.unilateral_impact import StandingFeet, unilateral_impact
+from impact_posture.impact.impact_contact import point_on
+from impact_posture.impact.resolved_impact import ResolvedImpact
+from impact_posture.posture.analysis.verdict import PredictedImpact, verdict
+from impact_posture.posture.formulation.problem_file import prepare
+from impact_posture.posture.search.multistart import solve
+from impact_posture.robot.robot import Robot
+
+FRICTIONS = (0.0, 0.3, 1.0)
+STIFFNESSES = (1e5, 1e6)
+# In a simulation, a foot or a contact point moves if its speed is above this share of the approach speed.
+MOVES = 0.01
+
+
+@dataclass(frozen=True)
+class Case:
+    """A robot that hits a surface: name of the robot, normal of the surface, and further settings."""
+
+    robot: str
+    normal: tuple[float, float, float]
+    more: Mapping[str, object] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """Robot, contact frame if it is not the default, and surface."""
+        return " ".join([self.robot, *map(str, self.more.values()), _SURFACES[self.normal]])
+
+
+_SURFACES = {DOWN: "floor", BACK: "wall", AHEAD: "from behind", ASIDE: "from the side"}
+# The simulation was written with these robots.
+CASES = (
+    Case("panda", DOWN),
+    Case("ur5", BACK),
+    Case("z1", BACK),
+    Case("tiago", BACK),
+    Case("tilthex_arm", BACK),
+    Case("borinot", DOWN),
+    Case("solo12", BACK),
+    Case("go2", BACK),
+    Case("bolt", BACK),
+    Case("anymal_kinova", BACK),
+    Case("talos", BACK),
+    Case("g1", BACK),
+)
+# These were tried when the simulation was finished.
+HELD_OUT = (
+    Case("xarm7", BACK),
+    Case("kinova", DOWN),
+    Case("hextilt", DOWN),
+    Case("solo8", AHEAD),
+    Case("hyq", ASIDE),
+    Case("anymal_c", DOWN),
+    Case("romeo", BACK),
+    Case("icub", BACK),
+    Case("talos", AHEAD, {"frame": "torso_2_link"}),
+    Case("g1", ASIDE, {"frame": "torso_link"}),
+)
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """Numbers of one impact, predicted or simulated.
+
+    Attributes:
+        jump: Norm ``‖Δν‖`` of the whole velocity jump.
+        linear, angular: Size of the linear and angular jump of a floating base, m/s and rad/s.
+        joint: Jump of the joint that the prediction names as the worst one, rad/s or m/s.
+        impulse: Normal impulse, N·s.
+        force: Largest normal force, N.
+        slips: Whether the contact point slides.
+        moving: Frames of the feet that lift or slide.
+    """
+
+    jump: float
+    linear: float | None
+    angular: float | None
+    joint: float
+    impulse: float
+    force: float
+    slips: bool
+    moving: frozenset[str]
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Prediction and simulation in one posture.
+
+    Attributes:
+        still: The simulation with the mass matrix and the Jacobians of the first posture.
+        time: Simulated compression time, s.
+        unsolved: Number of time steps whose conditions were not fulfilled.
+    """
+
+    predicted: Numbers
+    simulated: Numbers
+    still: Numbers
+    time: float
+    unsolved: int
+
+    def error(self, number: str, *, still: bool = False) -> float | None:
+        """Return the relative error of a predicted number."""
+        predicted, measured = (
+            getattr(side, number) for side in (self.predicted, self.still if still else self.simulated)
+        )
+        return None if predicted is None else predicted / measured - 1
+
+
+@dataclass(frozen=True)
+class Row:
+    """One verdict: case, friction, stiffness, whether the feet are held, and both postures."""
+
+    case: Case
+    friction: float
+    stiffness: float
+    feet: str  # "–", "held" or "free"
+    before: Pair
+    after: Pair
+
+    def changes(self, number: str) -> tuple[float, float] | None:
+        """Return the predicted and the simulated relative change of a number."""
+        if getattr(self.before.predicted, number) is None:
+            return None
+        sides = ("predicted", "simulated")
+        first, second = ([getattr(getattr(p, side), number) for side in sides] for p in (self.before, self.after))
+        return second[0] / first[0] - 1, second[1] / first[1] - 1
+
+
+@dataclass(frozen=True)
+class Compared:
+    """Rows of one case at one friction, and why others are missing."""
+
+    rows: tuple[Row, ...]
+    missing: tuple[str, ...]
+
+
+def compare(case: Case, friction: float, starts: int) -> Compared:
+    """Optimize, and compare both postures for each stiffness, with feet that are held and with feet that are free."""
+    settings = {"robot": case.robot, "normal": case.normal, "friction": friction, "objective": "auto", **case.more}
+    prepared = prepare(validate(ProblemSettings, settings, "options"))
+    solution = solve(prepared.problem, starts=starts, jobs=1, compile="never")
+    rows, missing = list[Row](), list[str]()
+    for stiffness in STIFFNESSES:
+        impact = replace(prepared.impact, contact_stiffness=ContactStiffness(linear=stiffness))
+        evaluations = [impact.evaluate(q) for q in (solution.initial, solution.q)]
+        said = verdict(impact, *evaluations)
+        sides = list(zip(evaluations, (said.before, said.after), strict=True))
+        for feet in ("held", "free") if impact.supports else ("–",):
+            pairs = [_pair(impact, evaluation, predicted, feet) for evaluation, predicted in sides]
+            reasons = [pair for pair in pairs if isinstance(pair, str)]
+            if reasons:
+                missing.append(f"{case.name}, friction {friction:g}, {stiffness:g} N/m: {reasons[0]}")
+            else:
+                rows.append(Row(case, friction, stiffness, feet, *pairs))
+    return Compared(tuple(rows), tuple(missing))
+
+
+def _pair(impact: ResolvedImpact, evaluation: Evaluation, said: PredictedImpact, feet: str) -> Pair | str:
+    """Simulate the impact in one posture; return a reason if there is nothing to compare."""
+    robot, contact, q, v = impact.robot, impact.contact, evaluation.q, impact.speed
+    surface = Surface(np.array(contact.normal), v, impact.contact_stiffness.linear, contact.friction)
+    jump, impulse, force, moving = evaluation.coulomb.velocity, said.impulse, said.peak_force, ()
+    if feet == "free":
+        standing = StandingFeet(impact.objective.oracle, impact.supports, q, contact.friction)
+        unilateral = unilateral_impact(standing, [impact.objective.oracle], v, evaluation.compression.time)
+        if unilateral is None:
+            return "no prediction for feet that lift"
+        jump, impulse = unilateral.jump, float(surface.normal @ unilateral.impulses[0])
+        force, moving = float(np.sqrt(surface.stiffness * v * impulse)), (*unilateral.lifts, *unilateral.slides)
+    points, frames = feet_of(robot)
+    hit = point_on(robot, contact.frame, contact.offset)
+    joint = worst_joint(robot, jump)
+    simulated = []
+    for still in (False, True):
+        arguments = robot.model, q, Point(hit.joint, hit.position), points
+        simulation = ImpactSimulation(*arguments, held=feet == "held", still=still)
+        if not simulation.stands:
+            return "the robot falls at rest"
+        result = simulation.run(surface)
+        went = {f for f, speed in zip(frames, result.feet, strict=False) if speed > MOVES * v}
+        numbers = float(surface.normal @ result.impulse), result.force, result.slip > MOVES * v, went
+        simulated.append((_numbers(robot, result.jump, joint, *numbers), result))
+    (moved, result), (still_numbers, _) = simulated
+    predicted = _numbers(robot, jump, joint, impulse, force, not said.sticks, moving)
+    return Pair(predicted, moved, still_numbers, result.time, result.unsolved)
+
+
+def _numbers(
+    robot: Robot, jump: Vector, joint: int, impulse: float, force: float, slips: bool, moving: Iterable[str]
+) -> Numbers:
+    linear, angular = (float(np.linalg.norm(jump[part])) for part in (slice(3), slice(3, 6)))
+    base = (linear, angular) if robot.floating else (None, None)
+    size = float(np.linalg.norm(jump))
+    return Numbers(size, *base, abs(float(jump[joint])), impulse, force, slips, frozenset(moving))
+
+
+def feet_of(robot: Robot) -> tuple[list[Point], list[str]]:
+    """Return the points of the feet in robot.toml, and the frame of each point."""
+    points, frames = list[Point](), list[str]()
+    for support in robot.spec.supports:
+        foot = point_on(robot, support.frame, support.offset)
+        X, Y = support.size
+        corners = [(x, y, 0.0) for x in (-X, X) for y in (-Y, Y)] if support.has_sole else [(0.0, 0.0, 0.0)]
+        points += [Point(foot.joint, foot.placement.act(np.array(corner))) for corner in corners]
+        frames += [support.frame] * len(corners)
+    return points, frames
+
+
+def worst_joint(robot: Robot, jump: Vector) -> int:
+    """Return the index of the joint velocity that is the largest share of its limit."""
+    sizes = np.abs(jump) / robot.velocity_limits
+    sizes[: 6 if robot.floating else 0] = -1.0
+    return int(np.argmax(sizes))
