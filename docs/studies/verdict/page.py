@@ -108,7 +108,8 @@ def _counts(rows: Sequence[Row], request: Request) -> Iterator[str]:
     sliding = [pair for row, _, pair in _pairs(rows) if row.friction > 0]
     same = sum(pair.predicted.slips == pair.simulated.slips for pair in sliding)
     yield ""
-    yield f"Stick or slip is as predicted in {same} of {len(sliding)} impacts with friction."
+    yield f"Stick or slip is as predicted in {same} of {len(sliding)} impacts with friction. The worst joint is the"
+    yield f"predicted one in {sum(pair.named for pair in pairs)} of {len(pairs)} impacts."
     if rows[0].feet == "free":
         stay = [pair for pair in pairs if not pair.predicted.moving]
         move = [pair for pair in pairs if pair.predicted.moving]

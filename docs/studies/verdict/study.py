@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from docs.studies.cases import AHEAD, ASIDE, BACK, DOWN
 from docs.studies.core import Vector
-from docs.studies.verdict.impact_simulation import ImpactSimulation, Point, Surface
+from docs.studies.verdict.impact_simulation import ImpactSimulation, Point, SimulatedImpact, Surface
 from impact_posture.config.problem_settings import ProblemSettings
 from impact_posture.config.table_validation import validate
 from impact_posture.impact.elasticity.contact_compression import ContactStiffness
 from impact_posture.impact.evaluation.evaluation import Evaluation
-from impact_posture.impact.friction.unilateral_impact import StandingFeet, unilateral_impact
+from impact_posture.impact.evaluation.impact_effect import impact_effect
+from impact_posture.impact.friction.unilateral_impact import StandingFeet, UnilateralImpact, unilateral_impact
 from impact_posture.impact.impact_contact import point_on
 from impact_posture.impact.resolved_impact import ResolvedImpact
-from impact_posture.posture.analysis.verdict import PredictedImpact, verdict
+from impact_posture.posture.analysis.verdict import verdict
+from impact_posture.posture.analysis.verdict_changes import PredictedImpact
 from impact_posture.posture.formulation.problem_file import prepare
 from impact_posture.posture.search.multistart import solve
 from impact_posture.robot.robot import Robot
@@ -26,6 +28,8 @@ FRICTIONS = (0.0, 0.3, 1.0)
 STIFFNESSES = (1e5, 1e6)
 # In a simulation, a foot or a contact point moves if its speed is above this share of the approach speed.
 MOVES = 0.01
+# The joint that the prediction names is right if no other joint has a share of its limit that is larger by 5 %.
+_SAME_JOINT = 0.05
 
 
 @dataclass(frozen=True)
@@ -75,7 +79,7 @@ HELD_OUT = (
 
 @dataclass(frozen=True)
 class Numbers:
-    """Numbers of one impact, predicted or simulated.
+    """Numbers of one impact in one posture, predicted or simulated.
 
     Attributes:
         jump: Norm ``‖Δν‖`` of the whole velocity jump.
@@ -103,6 +107,8 @@ class Pair:
 
     Attributes:
         still: The simulation with the mass matrix and the Jacobians of the first posture.
+        named: Whether the joint that the prediction names has the largest share of its velocity limit in the
+            simulation, up to 5 %.
         time: Simulated compression time, s.
         unsolved: Number of time steps whose conditions were not fulfilled.
     """
@@ -110,6 +116,7 @@ class Pair:
     predicted: Numbers
     simulated: Numbers
     still: Numbers
+    named: bool
     time: float
     unsolved: int
 
@@ -172,19 +179,23 @@ def compare(case: Case, friction: float, starts: int) -> Compared:
 
 def _pair(impact: ResolvedImpact, evaluation: Evaluation, said: PredictedImpact, feet: str) -> Pair | str:
     """Simulate the impact in one posture; return a reason if there is nothing to compare."""
-    robot, contact, q, v = impact.robot, impact.contact, evaluation.q, impact.speed
-    surface = Surface(np.array(contact.normal), v, impact.contact_stiffness.linear, contact.friction)
-    jump, impulse, force, moving = evaluation.coulomb.velocity, said.impulse, said.peak_force, ()
+    robot, contact, q = impact.robot, impact.contact, evaluation.q
+    surface = Surface(np.array(contact.normal), impact.speed, impact.contact_stiffness.linear, contact.friction)
+    moving = frozenset[str]()
     if feet == "free":
         standing = StandingFeet(impact.objective.oracle, impact.supports, q, contact.friction)
-        unilateral = unilateral_impact(standing, [impact.objective.oracle], v, evaluation.compression.time)
+        unilateral = unilateral_impact(
+            standing, [impact.objective.oracle], surface.speed, evaluation.compression.time
+        )
         if unilateral is None:
             return "no prediction for feet that lift"
-        jump, impulse = unilateral.jump, float(surface.normal @ unilateral.impulses[0])
-        force, moving = float(np.sqrt(surface.stiffness * v * impulse)), (*unilateral.lifts, *unilateral.slides)
+        said, moving = _with(said, robot, unilateral, surface), frozenset((*unilateral.lifts, *unilateral.slides))
+    predicted = Numbers(
+        said.jump, said.base_linear, said.base_angular, said.joint.velocity, said.impulse, said.peak_force,
+        not said.sticks, moving,
+    )  # fmt: skip
     points, frames = feet_of(robot)
     hit = point_on(robot, contact.frame, contact.offset)
-    joint = worst_joint(robot, jump)
     simulated = []
     for still in (False, True):
         arguments = robot.model, q, Point(hit.joint, hit.position), points
@@ -192,21 +203,45 @@ def _pair(impact: ResolvedImpact, evaluation: Evaluation, said: PredictedImpact,
         if not simulation.stands:
             return "the robot falls at rest"
         result = simulation.run(surface)
-        went = {f for f, speed in zip(frames, result.feet, strict=False) if speed > MOVES * v}
-        numbers = float(surface.normal @ result.impulse), result.force, result.slip > MOVES * v, went
-        simulated.append((_numbers(robot, result.jump, joint, *numbers), result))
+        simulated.append((_numbers(robot, result, said.joint.name, surface, frames), result))
     (moved, result), (still_numbers, _) = simulated
-    predicted = _numbers(robot, jump, joint, impulse, force, not said.sticks, moving)
-    return Pair(predicted, moved, still_numbers, result.time, result.unsolved)
+    share = _worst_share(robot, result.jump)
+    named = share[robot.tangent_names.index(said.joint.name)] >= (1 - _SAME_JOINT) * share.max()
+    return Pair(predicted, moved, still_numbers, bool(named), result.time, result.unsolved)
 
 
-def _numbers(
-    robot: Robot, jump: Vector, joint: int, impulse: float, force: float, slips: bool, moving: Iterable[str]
-) -> Numbers:
-    linear, angular = (float(np.linalg.norm(jump[part])) for part in (slice(3), slice(3, 6)))
-    base = (linear, angular) if robot.floating else (None, None)
-    size = float(np.linalg.norm(jump))
-    return Numbers(size, *base, abs(float(jump[joint])), impulse, force, slips, frozenset(moving))
+def _with(said: PredictedImpact, robot: Robot, unilateral: UnilateralImpact, surface: Surface) -> PredictedImpact:
+    """Return the prediction with the jump and the impulse of feet that lift and slide."""
+    impulse = float(surface.normal @ unilateral.impulses[0])
+    return replace(
+        said,
+        **vars(impact_effect(robot, unilateral.jump)),
+        impulse=impulse,
+        peak_force=float(np.sqrt(surface.stiffness * surface.speed * impulse)),
+        jump=float(np.linalg.norm(unilateral.jump)),
+    )
+
+
+def _numbers(robot: Robot, result: SimulatedImpact, joint: str, surface: Surface, frames: list[str]) -> Numbers:
+    least = MOVES * surface.speed
+    linear, angular = (float(np.linalg.norm(result.jump[part])) for part in (slice(3), slice(3, 6)))
+    return Numbers(
+        jump=float(np.linalg.norm(result.jump)),
+        linear=linear if robot.floating else None,
+        angular=angular if robot.floating else None,
+        joint=abs(float(result.jump[robot.tangent_names.index(joint)])),
+        impulse=float(surface.normal @ result.impulse),
+        force=result.force,
+        slips=result.slip > least,
+        moving=frozenset(f for f, speed in zip(frames, result.feet, strict=False) if speed > least),
+    )
+
+
+def _worst_share(robot: Robot, jump: Vector) -> Vector:
+    """Return the jump of each joint as a share of its velocity limit, shape (nv,); zero for a floating base."""
+    shares = np.abs(jump) / robot.velocity_limits
+    shares[: 6 if robot.floating else 0] = 0.0
+    return shares
 
 
 def feet_of(robot: Robot) -> tuple[list[Point], list[str]]:
@@ -219,10 +254,3 @@ def feet_of(robot: Robot) -> tuple[list[Point], list[str]]:
         points += [Point(foot.joint, foot.placement.act(np.array(corner))) for corner in corners]
         frames += [support.frame] * len(corners)
     return points, frames
-
-
-def worst_joint(robot: Robot, jump: Vector) -> int:
-    """Return the index of the joint velocity that is the largest share of its limit."""
-    sizes = np.abs(jump) / robot.velocity_limits
-    sizes[: 6 if robot.floating else 0] = -1.0
-    return int(np.argmax(sizes))
