@@ -14,9 +14,10 @@ from impact_posture.api.posture_problem import PostureProblem
 from impact_posture.config.checked import checked
 from impact_posture.config.demand import OneOrMore, ZeroOrMore
 from impact_posture.config.problem_settings import STARTS, TRADEOFF_POINTS, Against, Search
-from impact_posture.errors import InputError
+from impact_posture.errors import Infeasible, InputError
 from impact_posture.output.result_folder import FORMATS, Written, finish_result
 from impact_posture.output.result_reader import SolvedPostures, result_view
+from impact_posture.posture.analysis.least_force import explain_force_bound
 from impact_posture.posture.analysis.pareto_front import pareto_front
 from impact_posture.posture.analysis.result_document import result_arrays, result_document
 from impact_posture.posture.analysis.robustness import Robustness, compare_variants, solve_robustly
@@ -248,10 +249,15 @@ def optimize(
     """
     if search == "global":
         check_searchable(problem.problem)
-    solved = solve_robustly(
-        problem.problem, starts=starts, seed=seed, jobs=jobs, compile=compile, progress=progress,
-        finish_all=finish_all or search == "global",
-    )  # fmt: skip
+    try:
+        solved = solve_robustly(
+            problem.problem, starts=starts, seed=seed, jobs=jobs, compile=compile, progress=progress,
+            finish_all=finish_all or search == "global",
+        )  # fmt: skip
+    except Infeasible as error:
+        if problem.prepared is not None:
+            explain_force_bound(error, problem.prepared, starts=starts, seed=seed, jobs=jobs, compile=compile)
+        raise
     if search == "multistart":
         return PostureResult(problem, solved.solution, solved.robustness)
     best = search_globally(solved.solution, seed=seed, jobs=jobs, compile=compile, progress=progress)

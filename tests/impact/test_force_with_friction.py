@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,7 +20,10 @@ from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.posture.analysis.verdict import verdict
 from impact_posture.posture.constraints.impact_bounds import ImpactBounds
 from impact_posture.posture.formulation.problem_file import prepare
+from impact_posture.posture.manifold.feasible_start import feasible_start
+from impact_posture.posture.search.growing_search import feasible
 from impact_posture.posture.search.multistart import solve
+from tests.support.command import refused, run
 from tests.support.helpers import (
     central_gradient,
     frame_jacobian,
@@ -113,3 +118,21 @@ def test_no_posture_exceeds_a_bound_on_the_simulated_force(friction: float) -> N
     J = frame_jacobian(model, solution.q, impact.robot.frame_id(impact.contact.frame), impact.contact.offset)[:3]
     stepped = spring_impact(mass_matrix(model, solution.q), J, np.array([0.0, 0, 1]), friction, 1e5, 1.0)
     assert stepped.force <= 0.9 * start.peak_force * 1.001
+
+
+def test_a_bound_that_no_posture_keeps_names_the_least_force(tmp_path: Path) -> None:
+    """Random feasible postures exert no less than the least force in the error, and that force is a valid bound."""
+    task = {"robot": "tilthex_arm", "normal": (0, 0, 1), "contact_stiffness": 1e5, "approach": True}
+    words = "optimize tilthex_arm --normal 0 0 1 --contact-stiffness 1e5 --no-codegen --no-report --max-force"
+    done = run(*words.split(), 20, cwd=tmp_path)
+    refused(done, 3, "--max-force: 20 N cannot be kept: the least peak force that 16 starts reached")
+    (least,) = map(float, re.findall(r"under the other constraints is ([\d.]+) N; permit more", done.stderr))
+    free = prepare(make_settings(task))
+    starts = (feasible_start(free.problem, index, 0) for index in range(1, 40))
+    feasible_starts = [q for q in starts if q is not None and feasible(free.problem, q)]
+    solved = solve(prepare(make_settings({**task, "max_force": 1.01 * least})).problem, starts=4, compile="never")
+    forces = [
+        at.peak_force or 0.0 for q in (*feasible_starts, solved.q) if (at := free.impact.evaluate(q).compression)
+    ]
+    assert len(forces) > 10 and min(forces) > least * (1 - 1e-3)
+    assert solved.certificate.holds() and forces[-1] <= 1.01 * least * (1 + 1e-6)

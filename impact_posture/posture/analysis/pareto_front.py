@@ -28,8 +28,8 @@ from impact_posture.config.checked import checked
 from impact_posture.config.demand import OneOrMore
 from impact_posture.config.problem_settings import TRADEOFF_POINTS
 from impact_posture.errors import InputError, MetricError
-from impact_posture.impact.effective_mass_objective import EffectiveMassObjective
 from impact_posture.impact.elasticity.contact_compression import ContactStiffness
+from impact_posture.posture.analysis.least_force import least_effective_mass
 from impact_posture.posture.analysis.trade_off import TradeOff, TradePoint, find_knee
 from impact_posture.posture.analysis.trade_off_price import DistancePrice, ForcePrice, TradeOffPrice
 from impact_posture.posture.program.certificate import Certificate, certify
@@ -37,7 +37,7 @@ from impact_posture.posture.program.compiled_solver import CompileMode
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem
 from impact_posture.posture.program.posture_nlp import PostureNLP, WarmStart, build_nlp
 from impact_posture.posture.search.growing_search import Progress, run_start
-from impact_posture.posture.search.multistart import PostureSolution, solve
+from impact_posture.posture.search.multistart import PostureSolution
 from impact_posture.system.arrays import Array
 
 # Tolerance below which two prices are treated as equal, relative or in rad or m.
@@ -98,9 +98,7 @@ def _price(
     if objective.others:
         fault = "bounds the force of one contact, but there are several contacts"
         raise InputError(fault, where="tradeoff_against", hint="give one `contact`")
-    # The posture with the least effective mass has the least force.
-    mass = EffectiveMassObjective.of(objective)
-    least = solve(replace(problem, objective=mass), starts=_FORCE_STARTS, compile=compile, guesses=[solution.q])
+    least = least_effective_mass(problem, starts=_FORCE_STARTS, compile=compile, guesses=[solution.q])
     return ForcePrice(objective, contact, speed, least.q)
 
 
