@@ -65,12 +65,7 @@ def path_figure(view: ResultView) -> Figure:
         drawn = draw_shares(axes, path.s, path)
         for word, s, align in (("start", path.s[0], "left"), ("optimum", path.s[-1], "right")):
             axes.axvline(s, **_MARK)
-            look = {
-                "xycoords": ("data", "axes fraction"),
-                "textcoords": "offset points",
-                "ha": align,
-                "fontsize": LEGEND,
-            }
+            look = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points", "ha": align, "size": LEGEND}
             axes.annotate(word, (s, 1.0), (0, 3), **look)
         axes.set_xlabel("path length in the null space, ∫‖dq‖  [rad, mixed with m]")
         if drawn:
