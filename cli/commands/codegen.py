@@ -73,7 +73,7 @@ def codegen(
     else:
         from impact_posture.codegen.export import write_export
 
-        objectives, optimum, squeezed, warnings = _objectives(typed, robot, from_result)
+        objectives, optimum, squeezed, warnings, choice = _objectives(typed, robot, from_result)
         with page.progress("writing and compiling" if compile else "writing"):
             written = write_export(
                 objectives, place, prefix=prefix, posture=optimum, compression=squeezed, single=float_,
@@ -86,6 +86,7 @@ def codegen(
             ("posture", "the result's optimum" if optimum is not None else "none"),
             ("numbers", written.manifest["real"]),
             ("stack", f"at most {written.manifest['stack_bytes']} bytes"),
+            *([("choice", choice)] if choice else []),
         ]
     if json:
         print_json(written.to_dict())
@@ -113,20 +114,21 @@ def _check_problem(typed: TypedSettings, robot: str) -> None:
 
 def _objectives(
     typed: TypedSettings, robot: str, from_result: bool
-) -> tuple[list[WorstCaseObjective], Array | None, Compression | None, tuple[str, ...]]:
-    """Return the objectives, the optimal posture of a result, the first known contact compression, and warnings."""
+) -> tuple[list[WorstCaseObjective], Array | None, Compression | None, tuple[str, ...], str]:
+    """Return objectives, the optimum of a result, the first known compression, warnings, and why ``auto`` chose."""
     if from_result:
         from impact_posture.output.result_reader import load_view
 
         view = load_view(Path(robot))
-        return [view.objective], view.q_optimal, None, ()
+        return [view.objective], view.q_optimal, None, (), ""
     from impact_posture.impact.elasticity.contact_compression import compression
     from impact_posture.impact.resolved_impact import resolve
 
     frames = typed.values.get("frame", (None,))
     impacts = [resolve(typed.fill(ImpactSettings, robot=robot, frame=frame)) for frame in frames]
     known = (compression(one.objective, one.q, one.speed, one.contact_stiffness) for one in impacts)
-    return [one.objective for one in impacts], None, next(filter(None, known), None), impacts[-1].warnings
+    last = impacts[-1]
+    return [one.objective for one in impacts], None, next(filter(None, known), None), last.warnings, last.choice
 
 
 def _controller_parts(
