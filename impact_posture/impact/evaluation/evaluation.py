@@ -33,6 +33,7 @@ from impact_posture.impact.evaluation.objective_value import (
     variant_values,
     worst_variant,
 )
+from impact_posture.impact.evaluation.standing_impact import StandingImpact, standing_impact
 from impact_posture.impact.evaluation.velocity_jump import Jump, frictionless_jump, normal_jump, sticking_jump
 from impact_posture.impact.friction.contact_stability import ContactStability, contact_stability
 from impact_posture.impact.impact_contact import LARGEST, point_on
@@ -81,6 +82,8 @@ class Evaluation:
         compliance_effect: Relative change of H if the supports have a tenth of the compliance; ``None`` for a robot
             without supports.
         contact_stability: Whether the feet stay on the ground in the impact; ``None`` for a robot without supports.
+        standing: The impact if the ground can only push the feet; ``None`` for a robot without supports, or if there
+            is no such impact.
         contacts: Separate evaluation of each contact, the leading contact first; empty if there is only one contact.
         impulses: Worst impulses of several contacts; ``None`` if there is only one contact.
         model_variants: Objective and scalars for each model variant; empty if there are no variants.
@@ -112,6 +115,7 @@ class Evaluation:
     without_supports: Scalars | None
     compliance_effect: float | None
     contact_stability: ContactStability | None
+    standing: StandingImpact | None
     contacts: tuple[Evaluation, ...]
     impulses: WorstImpulses | None
     model_variants: tuple[VariantValue, ...]
@@ -141,7 +145,7 @@ class Evaluation:
         if self.without_supports is not None:
             block |= {"free": content["without_supports"], "compliance_effect": self.compliance_effect}
         if self.contact_stability is not None:
-            block["footing"] = content["contact_stability"]
+            block |= {"footing": content["contact_stability"], "lifting_feet": content["standing"]}
         if self.impulses is not None:
             block |= {"worst_impulses": content["impulses"], "coulomb_together": content["together"]}
             block["by_contact"] = [
@@ -210,6 +214,7 @@ def evaluate(
         without_supports=without_supports,
         compliance_effect=effect,
         contact_stability=contact_stability(oracle, objective.supports, q) if objective.supports else None,
+        standing=standing_impact(objective, q, rebound, None if squeezed is None else squeezed.time),
         contacts=tuple(evaluate(single, q, speed, restitution, contact_stiffness) for single in singles),
         impulses=member.worst_case.worst(q) if isinstance(member.worst_case, ImpulseBox) else None,
         model_variants=model_variants,

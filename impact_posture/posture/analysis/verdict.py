@@ -87,7 +87,7 @@ def verdict(
     told = f"At {impact.speed:g} m/s {contact}: {', '.join(numbers)}."
     refuted = any(condition.refutes for condition in stated)
     opening += ". " if opening else ""
-    told = f"verdict: {opening}{_sentence(outcome, refuted, bool(opening))}. {told}"
+    told = f"verdict: {opening}{_sentence(outcome, refuted, bool(opening))}. {told}{_lifted(impact, before, after)}"
     jump = relative_change(first.norm, last.norm)
     advice = (
         *(condition.hint for condition in stated if condition.hint),
@@ -118,15 +118,37 @@ def _sentence(outcome: str, refuted: bool, later: bool) -> str:
     return outcome.capitalize() if later else outcome
 
 
+def _lifted(impact: ResolvedImpact, before: Evaluation, after: Evaluation) -> str:
+    """Return a sentence with the outcome and the numbers if the feet can lift and slide; empty if all feet stay."""
+    first, last = before.standing, after.standing
+    if first is None or last is None or not (first.moves or last.moves):
+        return ""
+    rebound = normal_jump(impact.speed, impact.restitution)
+    masses = [side.jump.normal_impulse / rebound for side in (first, last)]
+    forces: list[float | None] = [None, None]
+    if impact.contact_stiffness is not None and not before.contacts:
+        forces = [impact.contact_stiffness.peak_force(mass, impact.speed) for mass in masses]
+    sides = [_felt(side.jump, force) for side, force in zip((first, last), forces, strict=True)]
+    force = None if before.contacts else sqrt(masses[1] / masses[0]) - 1
+    if forces[0] is not None and forces[1] is not None:
+        force = relative_change(forces[0], forces[1])
+    felt = changes(sides[0], sides[1], impact.speed, force)
+    return f" With feet that lift or slide: {outcome_of(felt)}, {', '.join(change.line for change in felt)}."
+
+
 def _predicted(evaluation: Evaluation, jump: Jump) -> PredictedImpact:
     # If several contacts are struck at the same time, their forces are unknown.
     compression = None if evaluation.contacts else evaluation.compression
+    return _felt(jump, None if compression is None else compression.peak_force)
+
+
+def _felt(jump: Jump, peak_force: float | None) -> PredictedImpact:
     return PredictedImpact(
         base_linear=jump.effect.base_linear,
         base_angular=jump.effect.base_angular,
         joint=jump.effect.joint,
         impulse=jump.normal_impulse,
-        peak_force=None if compression is None else compression.peak_force,
+        peak_force=peak_force,
         jump=jump.norm,
         sticks=jump.sticks if isinstance(jump, CoulombJump) else None,
     )

@@ -56,7 +56,7 @@ def conditions(
     impact: ResolvedImpact, before: Evaluation, after: Evaluation, known: Circumstances
 ) -> tuple[Condition, ...]:
     """Return the conditions of the verdict on the posture of ``after``, the gravest first."""
-    parts = _singular(after), _feet(impact, before, after), _touch(impact, after), _start(known)
+    parts = _singular(after), _feet(before, after), _touch(impact, after), _start(known)
     return (*_arrival(impact, known), *chain.from_iterable(parts))
 
 
@@ -81,19 +81,12 @@ def _singular(after: Evaluation) -> Iterator[Condition]:
         )
 
 
-def _feet(impact: ResolvedImpact, before: Evaluation, after: Evaluation) -> Iterator[Condition]:
-    friction = impact.contact.friction
-    now = _faults(after, friction)
-    if now:
-        too = ", before and after" if now == _faults(before, friction) else ""
+def _feet(before: Evaluation, after: Evaluation) -> Iterator[Condition]:
+    now = after.standing
+    if now is not None and now.moves:
+        too = ", before and after" if before.standing is not None and now.fact == before.standing.fact else ""
         hint = "`keep_contacts` admits only postures whose feet stay"
-        yield Condition("feet", f"holds only if the feet stay; {' and '.join(now)}{too}", hint)
-
-
-def _faults(evaluation: Evaluation, friction: float) -> list[str]:
-    """Return what the impacts at all contacts do to the feet, without repetition."""
-    parts = [part.contact_stability for part in evaluation.contacts or (evaluation,)]
-    return list(dict.fromkeys(filter(None, (part.fault(friction) for part in parts if part is not None))))
+        yield Condition("feet", f"holds only if the feet stay; {now.fact}{too}", hint)
 
 
 def _touch(impact: ResolvedImpact, after: Evaluation) -> Iterator[Condition]:

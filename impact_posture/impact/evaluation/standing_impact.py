@@ -1,0 +1,94 @@
+"""The predicted impact of a standing robot whose feet can lift and slide, beside the prediction that they stay."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from impact_posture.config.json_block import json_block
+from impact_posture.impact.evaluation.velocity_jump import Jump, weighed_jump
+from impact_posture.impact.friction.unilateral_impact import StandingFeet, longest_lifting_time, unilateral_impact
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.system.arrays import Array
+
+# The weight is not counted in a contact of unknown duration.  The search for the duration that would keep the feet
+# on the ground ends here, s, because no impact lasts longer.
+_LONGEST = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class StandingImpact:
+    """The predicted impact if the ground can only push the feet.
+
+    Attributes:
+        jump: The velocity jump.
+        lifts: Frames of the feet that lift or tip.
+        slides: Frames of the feet that slide without lifting.
+        time: Time over which the feet carry the weight in this prediction, s: the compression time of the stated
+            contact, or zero if no contact is stated.
+        holding_time: Contact time from which on the weight keeps all feet in place, s; ``None`` if the time of the
+            contact is stated, if no foot moves, or if it is above 0.1 s.
+    """
+
+    jump: Jump
+    lifts: tuple[str, ...]
+    slides: tuple[str, ...]
+    time: float
+    holding_time: float | None
+
+    @property
+    def moves(self) -> bool:
+        """Whether a foot lifts or slides."""
+        return bool(self.lifts or self.slides)
+
+    @property
+    def fact(self) -> str:
+        """What the impact does to the feet, in words; empty if all feet stay."""
+        does = [
+            f"{verb} {', '.join(frames)}" for verb, frames in (("lifts", self.lifts), ("slides", self.slides)) if frames
+        ]
+        if not does:
+            return ""
+        if self.time > 0:
+            weight = f", although the weight over its {1e3 * self.time:.2g} ms is counted"
+        elif self.holding_time is not None:
+            weight = f" if the contact is shorter than {1e3 * self.holding_time:.2g} ms"
+        else:
+            weight = ""
+        return f"the impact {' and '.join(does)}{weight}"
+
+    def to_dict(self) -> dict[str, object]:
+        """Return JSON content."""
+        return json_block(self) | {"line": self.fact}
+
+
+def standing_impact(
+    objective: WorstCaseObjective, q: Array, rebound: float, time: float | None
+) -> StandingImpact | None:
+    """Predict the impact at ``q``, shape (nq,), with feet that can lift and slide.
+
+    ``rebound`` is ``(1+e) v_n``, m/s, and ``time`` the compression time of the contact, s; ``None`` if it is unknown.
+    The friction coefficient of the contact is also the coefficient of the feet.  Return ``None`` if the robot has no
+    supports or does not move, or if no impulses fulfill the conditions of the contacts.
+    """
+    if not objective.supports or rebound <= 0:
+        return None
+    singles = objective.singles if objective.others else (objective,)
+    hit = [single.oracle.at(q) for single in singles]
+    feet = StandingFeet(objective.oracle, objective.supports, q, objective.contact.friction)
+    counted = 0.0 if time is None or feet.forces is None else time
+    impact = unilateral_impact(feet, hit, rebound, counted)
+    if impact is None:
+        return None
+    holding = np.inf
+    if (impact.lifts or impact.slides) and time is None:
+        holding = longest_lifting_time(feet, hit, rebound, _LONGEST)
+    objective.oracle.at(q)
+    return StandingImpact(
+        weighed_jump(objective, impact.jump, impact.impulses[0]),
+        impact.lifts,
+        impact.slides,
+        counted,
+        float(holding) if np.isfinite(holding) else None,
+    )
