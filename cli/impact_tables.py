@@ -79,7 +79,9 @@ def worst_lines(page: Page, frames: Sequence[str], blocks: Mapping[str, Mapping[
         for name, part in zip(frames, block.get("by_contact", [block]), strict=True):
             if "footing" in part:
                 where = f" (impact at {name})" if "by_contact" in block else ""
-                page.line(f"feet{when}{where}: {part['footing']['verdict']}")
+                lifting, footing = part.get("lifting_feet"), part["footing"]
+                line = lifting["line"] if lifting and not footing["stays"] else footing["verdict"]
+                page.line(f"feet{when}{where}: {line}")
 
 
 def _impulses(frames: Sequence[str], worst: Mapping[str, Any]) -> str:

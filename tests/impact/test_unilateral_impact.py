@@ -111,13 +111,13 @@ def test_the_time_above_which_the_weight_holds_the_feet() -> None:
     objective, q = hit("solo12", np.array([1.0, 0.0, 0.0]), 0.7)
     feet = StandingFeet(objective.oracle, objective.supports, q, 0.7)
     time = longest_lifting_time(feet, [objective.oracle], 1.0)
-    before = unilateral_impact(feet, [objective.oracle], 1.0, 0.98 * time)
+    before = unilateral_impact(feet, [objective.oracle], 1.0, 0.95 * time)
     after = unilateral_impact(feet, [objective.oracle], 1.0, time)
     assert before is not None and after is not None
     assert before.lifts or before.slides
     assert not (after.lifts or after.slides)
     # Twice the speed needs twice the weight.
-    assert longest_lifting_time(feet, [objective.oracle], 2.0) == pytest.approx(2 * time, rel=0.03)
+    assert longest_lifting_time(feet, [objective.oracle], 2.0) == pytest.approx(2 * time, rel=0.1)
 
 
 def test_a_robot_that_cannot_stand_has_no_prediction_with_weight() -> None:

@@ -158,10 +158,25 @@ def test_feet_that_the_impact_lifts_come_first() -> None:
     impact = resolved("talos")
     evaluation = impact.evaluate()
     told = verdict(impact, evaluation, evaluation)
-    assert evaluation.contact_stability is not None
-    lifted = [foot.frame for foot in evaluation.contact_stability.feet if foot.lifts]
-    assert lifted and told.line.startswith("verdict: holds only if the feet stay; the impact lifts ")
-    assert f"lifts {', '.join(lifted)}, before and after" in told.line and ". No better. At 1 m/s" in told.line
+    standing = evaluation.standing
+    assert standing is not None and standing.lifts and standing.holding_time is not None and standing.time == 0
+    assert told.line.startswith(f"verdict: holds only if the feet stay; the impact lifts or tips {standing.lifts[0]}")
+    assert f"if the contact is shorter than {1e3 * standing.holding_time:.2g} ms, before and after" in told.line
+    assert ". No better. At 1 m/s" in told.line and ". With feet that lift or slide: no better, base" in told.line
+    assert f"{standing.jump.normal_impulse:.3g} to" in told.line.partition("With feet")[2]
+
+
+def test_the_weight_counts_if_the_contact_is_stated() -> None:
+    impact = resolved("talos")
+    duration = 0.05
+    stated = replace(impact, contact_stiffness=ContactStiffness(duration=duration))
+    evaluation = stated.evaluate()
+    assert evaluation.standing is not None and not evaluation.standing.moves and evaluation.standing.time == duration
+    told = verdict(stated, evaluation, evaluation)
+    assert "feet" not in [condition.key for condition in told.conditions] and "With feet" not in told.line
+    brief = replace(impact, contact_stiffness=ContactStiffness(duration=1e-4)).evaluate()
+    assert brief.standing is not None and brief.standing.moves
+    assert "with the weight over the 0.1 ms of the contact" in brief.standing.fact
 
 
 def test_a_posture_against_itself() -> None:

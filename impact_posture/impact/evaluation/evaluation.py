@@ -159,7 +159,20 @@ class Evaluation:
 
 _JUMP = ("speed", "restitution", "frictionless", "sticking", "coulomb", "energy_loss")
 # Keys of the block of each single contact.  Posture and objective are not included: they concern all contacts.
-_CONTACT = ("H", "G", "V", "S", "E", "effective_mass", "gradient", "ellipsoid", "pose", "free", "footing")
+_CONTACT = (
+    "H",
+    "G",
+    "V",
+    "S",
+    "E",
+    "effective_mass",
+    "gradient",
+    "ellipsoid",
+    "pose",
+    "free",
+    "footing",
+    "lifting_feet",
+)
 
 
 @checked

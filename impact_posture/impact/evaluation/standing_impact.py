@@ -44,19 +44,16 @@ class StandingImpact:
 
     @property
     def fact(self) -> str:
-        """What the impact does to the feet, in words; empty if all feet stay."""
-        does = [
-            f"{verb} {', '.join(frames)}" for verb, frames in (("lifts", self.lifts), ("slides", self.slides)) if frames
-        ]
+        """What the impact does to the feet, in words."""
+        counted = f" with the weight over the {1e3 * self.time:.2g} ms of the contact" if self.time > 0 else ""
+        moved = (("lifts or tips", self.lifts), ("slides", self.slides))
+        does = [f"{verb} {', '.join(frames)}" for verb, frames in moved if frames]
         if not does:
-            return ""
-        if self.time > 0:
-            weight = f", although the weight over its {1e3 * self.time:.2g} ms is counted"
-        elif self.holding_time is not None:
-            weight = f" if the contact is shorter than {1e3 * self.holding_time:.2g} ms"
-        else:
-            weight = ""
-        return f"the impact {' and '.join(does)}{weight}"
+            return f"the feet stay{counted}"
+        shorter = (
+            "" if self.holding_time is None else f" if the contact is shorter than {1e3 * self.holding_time:.2g} ms"
+        )
+        return f"the impact {' and '.join(does)}{counted}{shorter}"
 
     def to_dict(self) -> dict[str, object]:
         """Return JSON content."""

@@ -141,7 +141,7 @@ def unilateral_impact(
 def longest_lifting_time(feet: StandingFeet, hit: Sequence[ImpactOracle], speed: float, most: float = 1.0) -> float:
     """Return the compression time, s, above which no foot lifts or slides; infinite if above ``most``.
 
-    The weight that a foot carries grows with the time, so bisection finds this time up to 1 %.
+    The weight that a foot carries grows with the time, so bisection finds this time up to 5 %.
     """
 
     def moves(time: float) -> bool:
@@ -150,10 +150,10 @@ def longest_lifting_time(feet: StandingFeet, hit: Sequence[ImpactOracle], speed:
 
     if moves(most):
         return np.inf
-    low, high = most * 1e-4, most
+    low, high = most * 1e-3, most
     if not moves(low):
         return 0.0 if not moves(0.0) else low
-    while high > 1.01 * low:
+    while high > 1.05 * low:
         middle = float(np.sqrt(low * high))
         low, high = (middle, high) if moves(middle) else (low, middle)
     return high
