@@ -38,8 +38,9 @@ def finish(code: int) -> NoReturn:
     for number in _WORDS:
         signal.signal(number, signal.SIG_IGN)
     atexit._run_exitfuncs()
-    with suppress(OSError, ValueError):
-        sys.stdout.flush()
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError):
+            stream.flush()
     os._exit(code)
 
 
