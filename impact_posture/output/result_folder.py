@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Sequence
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from impact_posture.errors import CompilerError, one_line
 from impact_posture.output.result_reader import SolvedPostures, motion_of, result_view
@@ -15,7 +15,7 @@ from impact_posture.posture.formulation.problem_file import Prepared
 from impact_posture.posture.search.growing_search import Progress
 from impact_posture.system.escape import file_name
 from impact_posture.system.output_folder import write_record
-from impact_posture.system.processes import fork_map
+from impact_posture.system.processes import fork_call, fork_map
 
 # Matplotlib and the C export are imported where they are used, because that takes longer than a small problem.
 if TYPE_CHECKING:
@@ -59,30 +59,32 @@ def finish_result(
     """Draw the figures of a result, export, build and check its C code, and write ``report.html``.
 
     The folder holds ``problem.toml`` and the path to the optimum, if a path was searched.  ``meshes`` permits the
-    report to hold the meshes of the user's own URDF.  ``jobs`` processes draw and compile side by side.  ``progress``
-    is called with the numbers of finished files and of all files.
+    report to hold the meshes of the user's own URDF.  ``jobs`` processes draw, and another writes the C code, if
+    ``jobs`` is more than one.  ``progress`` is called with the numbers of finished files and of all files.
     """
-    from impact_posture.output.plot import draw_all, drawable
-    from impact_posture.output.report.result_report import result_scene, write_result_report
-
-    view = result_view(prepared, postures, motion_of(folder, postures.document, prepared.impact.robot))
-    # The C code comes first, because it takes longest.
-    tasks: list[Callable[[], Any]] = [partial(_export, folder, prepared, postures)] if codegen else []
-    tasks += [partial(draw_all, view, folder, formats, [name]) for name in drawable(view)]
-    count, written = len(tasks) + report, Written(folder)
+    export = partial(_export, folder, prepared, postures) if codegen else partial(Written, folder)
     scene: ReportScene | None = None
-    with fork_map(lambda index: tasks[index](), len(tasks), jobs) as results:
-        if report:
-            # The main process prepares the scene while it waits for the workers.  An error here occurs again when
-            # the report is written, and is reported then.
-            with suppress(Exception):
-                scene = result_scene(prepared, view, meshes)
-                _ = scene.packed
-        for done, (index, result) in enumerate(results, start=1):
-            if codegen and index == 0:
-                written = result
-            if progress:
-                progress(done, count)
+    # The C code takes longest, so another process begins with it before this process imports matplotlib.
+    with fork_call(export) if codegen and jobs > 1 else nullcontext(export) as exported:
+        from impact_posture.output.plot import draw_all, drawable
+        from impact_posture.output.report.result_report import result_scene, write_result_report
+
+        view = result_view(prepared, postures, motion_of(folder, postures.document, prepared.impact.robot))
+        names = drawable(view)
+        count = len(names) + codegen + report
+        with fork_map(lambda k: draw_all(view, folder, formats, [names[k]]), len(names), jobs) as results:
+            if report:
+                # The main process prepares the scene while it waits for the workers.  An error here occurs again
+                # when the report is written, and is reported then.
+                with suppress(Exception):
+                    scene = result_scene(prepared, view, meshes)
+                    _ = scene.packed
+            written = exported()
+            if codegen and progress:
+                progress(1, count)
+            for done, _ in enumerate(results, start=1 + codegen):
+                if progress:
+                    progress(done, count)
     if not report:
         return written
     report_error = ""

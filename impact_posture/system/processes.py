@@ -135,6 +135,7 @@ def fork_call(function: Callable[[], _Result]) -> Iterator[Callable[[], _Result]
 
     Raises:
         OSError: The system cannot fork.
+        WorkerDied: The copy was killed, for example for lack of memory.
     """
     if not hasattr(os, "fork"):
         raise OSError("the system cannot fork")
@@ -158,7 +159,7 @@ def fork_call(function: Callable[[], _Result]) -> Iterator[Callable[[], _Result]
         try:
             error, result = receiver.recv()
         except (EOFError, ConnectionResetError):
-            raise OSError("a forked process has died") from None
+            raise WorkerDied() from None
         if error is not None:
             raise error
         return cast(_Result, result)

@@ -263,7 +263,7 @@ def test_the_error_of_a_copy_is_raised_here() -> None:
 
 
 def test_a_copy_that_dies_is_an_error() -> None:
-    with fork_call(lambda: os.kill(os.getpid(), signal.SIGKILL)) as collect, pytest.raises(OSError, match="has died"):
+    with fork_call(lambda: os.kill(os.getpid(), signal.SIGKILL)) as collect, pytest.raises(WorkerDied):
         collect()
 
 
