@@ -72,6 +72,7 @@ STUDIES = {
         Study("tsid", "tsid", "a tick of the online controllers; ticks", 2000),
         Study("relaxed", "relaxed", "relaxed ticks in C of pushed robots; budget of iterations", 100, page=False),
         Study("digits", "digits", "the digits that double precision keeps with feet; random postures", 3),
+        Study("fronts", "fronts", "where the default contact frames of the catalogue touch"),
         Study("shapes", "shapes", "the collision shapes of the catalogue, fitted anew"),
         Study("feasible", "feasible", "what feasibility costs; seeds", 3, target="study-feasible"),
         Study("approach", "approach", "speed at which robots arrive in their optima", target="study-feasible"),

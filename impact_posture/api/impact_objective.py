@@ -48,7 +48,7 @@ class ImpactObjective(WorstCaseObjective):
     Args:
         robot: The robot.
         contact: Contact of the impact, or several simultaneous contacts.  A contact without an offset gets the
-            offset of robot.toml if robot.toml has the same contact frame.
+            offset that robot.toml has for its frame.
         metric: Norm of the velocity jump: ``euclidean``, ``kinetic`` or ``weighted``, or a
             :class:`~impact_posture.impact.metric.Metric`.
         kind: Minimized quantity: ``impulse`` (λ̄²H), ``speed`` (V), ``sticking`` (S), ``coulomb`` (C) or ``energy``
@@ -146,9 +146,8 @@ class ImpactObjective(WorstCaseObjective):
 
 
 def _with_offset(robot: Robot, contact: ImpactContact) -> ImpactContact:
-    default = robot.spec.contact
-    missing = contact.frame == default.frame and not any(contact.offset) and any(default.offset)
-    return replace(contact, offset=default.offset) if missing else contact
+    default = robot.spec.contact.offset_of(contact.frame)
+    return replace(contact, offset=default) if any(default) and not any(contact.offset) else contact
 
 
 def _supports(robot: Robot, supports: Sequence[str | Support] | None) -> tuple[Support, ...]:

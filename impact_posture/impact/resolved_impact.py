@@ -134,7 +134,7 @@ def _contact(
         raise FrameNotFound(frame, tips(robot, feet(robot)), where=robot.name)
     offset = settings.offset
     if offset is None:
-        offset = robot.spec.contact.offset if frame == robot.spec.contact.frame else (0.0, 0.0, 0.0)
+        offset = robot.spec.contact.offset_of(frame)
     bound = settings.impulse if impulse is None else impulse
     contact = ImpactContact(frame, normal, offset, settings.normal_frame, bound, settings.friction)
     point_on(robot, contact.frame, contact.offset)

@@ -43,12 +43,17 @@ class PostureSpec(_Table):
 
 @dataclass(frozen=True)
 class ContactSpec(_Table):
-    """The default contact frame, and the default setting ``contact_pose`` of contact frames."""
+    """The default contact frame, and the default settings ``offset`` and ``contact_pose`` of contact frames."""
 
     frame: str | None = None
     offset: Vector3 = (0.0, 0.0, 0.0)
     pose: ContactPose = "full"
     frames: dict[str, ContactPose] = field(default_factory=dict)
+    offsets: dict[str, Vector3] = field(default_factory=dict)
+
+    def offset_of(self, frame: str) -> Vector3:
+        """Return the default contact point of a contact frame, in the frame, m."""
+        return self.offsets.get(frame, self.offset if frame == self.frame else (0.0, 0.0, 0.0))
 
 
 @checked

@@ -180,7 +180,8 @@ def test_evaluate_numbers_against_pinocchio() -> None:
 def test_evaluate_prints_all_quantities() -> None:
     task = ("--frame", "torso_2_link", "--normal", "-1", "0", "0", "--speed", "0.5", "--contact-point", "front")
     page = start("evaluate", "talos", *task)
-    assert page.returncode == 0 and page.stderr == ""
+    # The springs of the arms are not known.
+    assert page.returncode == 0 and [line[:26] for line in page.stderr.splitlines()] == ["warning: x is unknown: the"]
     assert max(len(line) for line in page.stdout.splitlines()) <= 80
     for words in (
         "torso_2_link", "-1.000  0.000  0.000", "left_sole_link (surface)", "compliance", "standing", "free", "1/kg",

@@ -211,7 +211,7 @@ def test_a_start_that_is_left_would_not_have_been_the_best(
     # Lower the size thresholds, so that a small program is treated like a large program.
     monkeypatch.setattr(search_module, "_SMALL", 0)
     monkeypatch.setattr(search_module, "_BATCH", 500)
-    problem = prepare(ProblemSettings(robot=robot, normal=normal)).problem
+    problem = prepare(ProblemSettings(robot=robot, normal=normal, offset=(0.0, 0.0, 0.0))).problem
     few, all_ = (
         solve(problem, starts=starts, jobs=2, compile="never", finish_all=finish_all) for finish_all in (False, True)
     )

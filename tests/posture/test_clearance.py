@@ -273,7 +273,9 @@ def test_an_obstacle_at_the_contact_is_named() -> None:
 )
 def test_a_turn_that_solves_a_conflict_is_the_hint(pose: str, position: tuple[float, ...] | None) -> None:
     """Freeing the orientation moves the wrist of z1 out of the floor, but does not help if the target is too far."""
-    settings = {"robot": "z1", "normal": (0.0, 0.0, 1.0), "contact_pose": pose, "target_position": position}
+    # The floor touches the gripper below the origin of the frame, not at its tip.
+    contact = {"robot": "z1", "normal": (0.0, 0.0, 1.0), "offset": (0.0, 0.0, 0.0)}
+    settings = contact | {"contact_pose": pose, "target_position": position}
     problem = prepare(validate(ProblemSettings, settings, "options")).problem
     with pytest.raises(Infeasible) as caught:
         solve(problem, jobs=1)

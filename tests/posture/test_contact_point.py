@@ -56,7 +56,8 @@ def test_a_contact_point_behind_the_front_is_said_everywhere(tmp_path: Path) -> 
     assert "or --contact-point front" in printed
     document = json.loads((tmp_path / "behind" / "result.json").read_text())
     (warning,) = (line for line in document["warnings"] if "a flat surface touches" in line)
-    assert any("a flat surface touches" in line for line in document["verdict"]["assumptions"])
+    (condition,) = (c for c in document["verdict"]["conditions"] if c["key"] == "contact point")
+    assert "a flat surface touches" in condition["line"] and condition["line"] in document["verdict"]["line"]
     assert run("report", "behind", cwd=tmp_path).returncode == 0
     assert "a flat surface touches" in (tmp_path / "behind" / "report.html").read_text(encoding="utf-8")
     numbers = warning.split("`offset` ")[1].split(",")[0].split()
