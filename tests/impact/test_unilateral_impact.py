@@ -73,16 +73,25 @@ def test_without_friction_an_active_set_gives_the_same_jump(
     response = np.linalg.solve(oracle.M, rows.T)
     A = rows @ response
     forces = np.zeros(len(A)) if feet.forces is None else np.concatenate([[0.0], feet.forces[:, 2]])
-    carried = forces * time
-    start = np.concatenate([[-1.0], np.zeros(len(A) - 1)]) - A @ carried
+    steps = 8 if time and feet.forces is not None else 1
+    jump = np.zeros(objective.robot.nv)
+    for k in range(1, steps + 1):
+        carried = forces * time / steps
+        start = rows @ jump - A @ carried
+        # The approach speed falls like the velocity of a mass on a spring.
+        start[0] -= 1 - (np.cos(np.pi / 2 * k / steps) if steps > 1 else 0.0)
+        jump = jump + response @ (active_set(A, start) - carried)
+    assert_close(impact.jump, jump, 1e-6, name)
+
+
+def active_set(A: Vector, start: Vector) -> Vector:
+    """Return ``p ≥ 0`` with ``u = start + A p ≥ 0`` and ``p·u = 0``, by trying every active set."""
     for active in product((False, True), repeat=len(A)):
         on = np.array(active)
         p = np.zeros(len(A))
         p[on] = np.linalg.lstsq(A[np.ix_(on, on)], -start[on], rcond=None)[0]
-        u = start + A @ p
-        if p.min() >= -1e-9 and u.min() >= -1e-9:
-            assert_close(impact.jump, response @ (p - carried), 1e-6, name)
-            return
+        if p.min() >= -1e-9 and (start + A @ p).min() >= -1e-9:
+            return p
     raise AssertionError("no active set fulfills the conditions")
 
 
@@ -101,9 +110,9 @@ def test_feet_lift_only_without_load(seed: int, name: str) -> None:
     assert oracle.n @ u >= 1 - 1e-6
     velocities = (feet.jacobian @ impact.jump).reshape(-1, 3)
     assert velocities[:, 2].min() > -1e-6
-    moving = {f for f, v in zip(feet.frames, velocities, strict=True) if np.linalg.norm(v) > 2e-4}
+    moving = {f for f, v in zip(feet.frames, velocities, strict=True) if np.linalg.norm(v) > 0.02}
     assert moving <= {*impact.lifts, *impact.slides}
-    staying = {f for f, v in zip(feet.frames, velocities, strict=True) if np.linalg.norm(v) < 5e-5}
+    staying = {f for f, v in zip(feet.frames, velocities, strict=True) if np.linalg.norm(v) < 5e-3}
     assert not staying & set(impact.lifts) or any(s.has_sole for s in objective.supports)
 
 
@@ -111,7 +120,7 @@ def test_the_time_above_which_the_weight_holds_the_feet() -> None:
     objective, q = hit("solo12", np.array([1.0, 0.0, 0.0]), 0.7)
     feet = StandingFeet(objective.oracle, objective.supports, q, 0.7)
     time = longest_lifting_time(feet, [objective.oracle], 1.0)
-    before = unilateral_impact(feet, [objective.oracle], 1.0, 0.95 * time)
+    before = unilateral_impact(feet, [objective.oracle], 1.0, 0.6 * time)
     after = unilateral_impact(feet, [objective.oracle], 1.0, time)
     assert before is not None and after is not None
     assert before.lifts or before.slides
@@ -127,3 +136,9 @@ def test_a_robot_that_cannot_stand_has_no_prediction_with_weight() -> None:
     assert feet.forces is None
     assert unilateral_impact(feet, [one.oracle], 1.0, 0.01) is None
     assert unilateral_impact(feet, [one.oracle], 1.0) is not None
+
+
+def test_a_robot_beside_its_feet_cannot_stand() -> None:
+    """The center of mass of bolt is behind the line of its two feet, so it falls although its feet do not move."""
+    objective, q = hit("bolt", np.array([1.0, 0.0, 0.0]), 0.7)
+    assert StandingFeet(objective.oracle, objective.supports, q, 0.7).forces is None

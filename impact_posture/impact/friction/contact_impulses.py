@@ -13,8 +13,10 @@ import pinocchio as pin
 
 from impact_posture.system.arrays import Array
 
-# Tolerance and largest number of iterations of ADMM.
+# Tolerance and largest number of iterations of ADMM, and its rules for the penalty.  The second rule is tried if the
+# first does not converge, which can happen for soles whose corners share their load in many ways.
 _TOLERANCE, _ITERATIONS = 1e-12, 20_000
+_RULES = (pin.ADMMUpdateRule.SPECTRAL, pin.ADMMUpdateRule.OSQP)
 # Largest error of impulses that fulfill the conditions, divided by the largest impulse.
 _ERROR = 1e-7
 
@@ -33,17 +35,20 @@ def contact_impulses(B: Array, before: Array, normals: Array, friction: Array) -
     size, speed = float(np.trace(B)) / len(B), float(np.abs(before).max())
     if not (size > 0 and speed > 0):
         return np.zeros_like(normals) if speed == 0 else None
-    impulses = _admm(turned @ (B / size) @ turned.T, turned @ (before.ravel() / speed), friction)
-    p = np.asarray(turned.T @ impulses).reshape(normals.shape) * speed / size
-    u = before + (B @ p.ravel()).reshape(p.shape)
-    slip = np.linalg.norm(u - (u * normals).sum(1, keepdims=True) * normals, axis=1)
-    # The impulses are the fixed point of this projection onto the friction cones (De Saxcé and Feng, 1998).
-    step = p - (u + (friction * slip)[:, None] * normals) / size
-    error = np.abs(p - [_on_cone(row, n, mu) for row, n, mu in zip(step, normals, friction, strict=True)]).max()
-    return p if error <= _ERROR * max(float(np.abs(p).max()), speed / size) else None
+    for rule in _RULES:
+        impulses = _admm(turned @ (B / size) @ turned.T, turned @ (before.ravel() / speed), friction, rule)
+        p = np.asarray(turned.T @ impulses).reshape(normals.shape) * speed / size
+        u = before + (B @ p.ravel()).reshape(p.shape)
+        slip = np.linalg.norm(u - (u * normals).sum(1, keepdims=True) * normals, axis=1)
+        # The impulses are the fixed point of this projection onto the friction cones (De Saxcé and Feng, 1998).
+        step = p - (u + (friction * slip)[:, None] * normals) / size
+        error = np.abs(p - [_on_cone(row, n, mu) for row, n, mu in zip(step, normals, friction, strict=True)]).max()
+        if error <= _ERROR * max(float(np.abs(p).max()), speed / size):
+            return p
+    return None
 
 
-def _admm(B: Array, before: Array, friction: Array) -> Array:
+def _admm(B: Array, before: Array, friction: Array, rule: pin.ADMMUpdateRule) -> Array:
     """Return the stacked impulses in axes whose third axis is the normal of the contact."""
     # The solver reads only the friction of these contacts.  Their model is not used.
     body = pin.Model()
@@ -55,7 +60,7 @@ def _admm(B: Array, before: Array, friction: Array) -> Array:
         contacts.append(pin.ConstraintModel(contact))
         data.append(contacts[-1].createData())
     settings, result = pin.ADMMSolverSettings(), pin.ADMMSolverResult()
-    settings.admm_update_rule = pin.ADMMUpdateRule.SPECTRAL
+    settings.admm_update_rule = rule
     settings.max_iterations = _ITERATIONS
     settings.absolute_feasibility_tol = settings.absolute_complementarity_tol = _TOLERANCE
     settings.relative_feasibility_tol = settings.relative_complementarity_tol = _TOLERANCE

@@ -1,14 +1,18 @@
 """The impact of a standing robot whose feet can lift and slide.
 
 The metric assumes that the ground can also pull the feet.  Here the ground only pushes, within the friction cone.
-Over the compression time T, the ground also carries the weight: a foot that stood with the force ``f`` lifts only if
-the impact pulls it with more than ``fT``.  Let ``P`` be the whole impulse of the ground, and ``p`` the impulse of the
-impact at the hit contact.  The motor torques do not change, so
+Over the compression time T, the ground also carries the weight, and the motor torques do not change.  Let ``f`` be
+the force of a foot before the impact, ``P`` the whole impulse of the ground, and ``p`` the impulse of the hit
+surface:
 
-    ``M Δν = Jᵀp + J_sᵀ(P − fT)``,
+    ``M Δν = Jᵀp + J_sᵀ(P − fT)``.
 
-and :mod:`~impact_posture.impact.friction.contact_impulses` states the conditions for ``p`` and ``P``.  The forces
-``f`` are computed for locked joints: they are the forces on a statue that stands on the same feet.
+:mod:`~impact_posture.impact.friction.contact_impulses` states the conditions for ``p`` and ``P``.  The forces ``f``
+are computed for locked joints: they are the forces on a statue that stands on the same feet.
+
+The force of a linear contact is a quarter of a sine wave, and it is largest at T.  The impact is therefore solved in
+steps, in which the approach speed falls as ``v cos(πt/2T)``.  All feet stay if their loads exceed the largest pull,
+which is π/2 times its mean.
 """
 
 from __future__ import annotations
@@ -25,8 +29,12 @@ from impact_posture.impact.quantities.impact_oracle import ImpactOracle
 from impact_posture.robot.robot_spec import Support
 from impact_posture.system.arrays import Array
 
-# A foot moves if its velocity after the impact is above this share of the approach speed.
-_MOVES = 1e-4
+# A foot moves if its velocity is above this share of the approach speed.
+_MOVES = 0.01
+# Number of steps of an impact in which the weight is counted.
+_STEPS = 8
+# A statue stands if its feet balance the weight up to this share.
+_STANDS = 1e-6
 # A singular value below this share of the largest one is a rounding error.
 _RANK = 1e-9
 
@@ -63,7 +71,7 @@ class StandingFeet:
 
     def __init__(self, oracle: ImpactOracle, supports: Sequence[Support], q: Array, friction: float) -> None:
         oracle.at(q)
-        self._oracle, self.friction = oracle, friction
+        self._oracle, self._q, self.friction = oracle, q, friction
         self.frames: list[str] = []
         rows, turns = [], []
         for foot, support in zip(oracle.feet, supports, strict=True):
@@ -92,14 +100,15 @@ class StandingFeet:
 
     def _carried(self) -> Array | None:
         """Return the forces under the weight if the robot is a rigid body: they stop its fall of one second."""
-        model = self._oracle.robot.model
-        base, gravity = self.jacobian[:, :6], np.tile(np.array(model.gravity.linear), len(self.frames))
+        model, base = self._oracle.robot.model, self.jacobian[:, :6]
+        fall = np.tile(np.array(model.gravity.linear), (len(self.frames), 1))
         B = base @ np.linalg.solve(self._oracle.numeric.mass_matrix()[:6, :6], base.T)
-        forces = contact_impulses(B, gravity.reshape(-1, 3), self.normals, np.full(len(self.frames), self.friction))
+        forces = contact_impulses(B, fall, self.normals, np.full(len(self.frames), self.friction))
         if forces is None:
             return None
-        moves = np.abs(gravity + B @ forces.ravel()).max() > _MOVES * np.linalg.norm(model.gravity.linear)
-        return None if moves else forces
+        weight = pin.computeGeneralizedGravity(model, model.createData(), self._q)[:6]
+        falls = np.abs(base.T @ forces.ravel() - weight).max() > _STANDS * np.abs(weight).max()
+        return None if falls else forces
 
 
 def unilateral_impact(
@@ -113,29 +122,42 @@ def unilateral_impact(
     """
     if time > 0 and feet.forces is None:
         return None
-    count = len(hit)
-    J = np.vstack([*(oracle.J for oracle in hit), feet.jacobian])
-    normals = np.vstack([*(oracle.n for oracle in hit), feet.normals])
-    friction = np.array([*(oracle.contact.friction for oracle in hit), *[feet.friction] * len(feet.frames)])
-    responses = feet.respond(J)
-    B = J @ responses
-    before, weight = np.zeros(normals.shape), np.zeros(normals.shape)
-    before[:count] = -speed * normals[:count]
-    if feet.forces is not None:
-        weight[count:] = time * feet.forces
-    start = before - (B @ weight.ravel()).reshape(before.shape)
-    P = contact_impulses((B + B.T) / 2, start, normals, friction)
-    if P is None:
-        return None
-    after = (start + (B @ P.ravel()).reshape(start.shape))[count:]
-    up = {frame: 0.0 for frame in feet.frames}
-    across = dict(up)
-    for frame, velocity in zip(feet.frames, after, strict=True):
-        up[frame] = max(up[frame], float(velocity[2]))
-        across[frame] = max(across[frame], float(np.linalg.norm(velocity[:2])))
-    lifts = tuple(frame for frame in up if up[frame] > _MOVES * speed)
-    slides = tuple(frame for frame in up if across[frame] > _MOVES * speed and frame not in lifts)
-    return UnilateralImpact(responses @ (P - weight).ravel(), P[:count].copy(), lifts, slides)
+    contacts = _Contacts(feet, hit)
+    # The approach speed that is left after each step.
+    left = speed * np.cos(np.pi / 2 * np.linspace(0, 1, _STEPS + 1)[1:]) if time > 0 else np.zeros(1)
+    jump, impulses, moved = np.zeros(feet.M.shape[0]), np.zeros((len(hit), 3)), np.zeros((2, len(feet.frames)))
+    for speed_left in left:
+        step = contacts.step(jump, speed, speed_left, time / len(left))
+        if step is None:
+            return None
+        jump, impulses = jump + step[0], impulses + step[1]
+        velocities = (feet.jacobian @ jump).reshape(-1, 3)
+        moved = np.maximum(moved, [velocities[:, 2], np.linalg.norm(velocities[:, :2], axis=1)])
+    lifts, slides = (list(dict.fromkeys(np.array(feet.frames)[row > _MOVES * speed].tolist())) for row in moved)
+    return UnilateralImpact(jump, impulses, tuple(lifts), tuple(frame for frame in slides if frame not in lifts))
+
+
+class _Contacts:
+    """The hit contacts, followed by the contact points of the feet, at one posture."""
+
+    def __init__(self, feet: StandingFeet, hit: Sequence[ImpactOracle]) -> None:
+        self._feet, self._count = feet, len(hit)
+        self._J = np.vstack([*(oracle.J for oracle in hit), feet.jacobian])
+        self._normals = np.vstack([*(oracle.n for oracle in hit), feet.normals])
+        self._friction = np.array([*(oracle.contact.friction for oracle in hit), *[feet.friction] * len(feet.frames)])
+        self._responses = feet.respond(self._J)
+        B = self._J @ self._responses
+        self._B = (B + B.T) / 2
+
+    def step(self, jump: Array, speed: float, speed_left: float, time: float) -> tuple[Array, Array] | None:
+        """Return the change of the jump and the impulses at the hit contacts, until ``speed_left`` is left."""
+        weight = np.zeros(self._normals.shape)
+        if time > 0 and self._feet.forces is not None:
+            weight[self._count :] = time * self._feet.forces
+        start = (self._J @ jump - self._B @ weight.ravel()).reshape(weight.shape)
+        start[: self._count] -= (speed - speed_left) * self._normals[: self._count]
+        P = contact_impulses(self._B, start, self._normals, self._friction)
+        return None if P is None else (self._responses @ (P - weight).ravel(), P[: self._count])
 
 
 def longest_lifting_time(feet: StandingFeet, hit: Sequence[ImpactOracle], speed: float, most: float = 1.0) -> float:
@@ -143,10 +165,12 @@ def longest_lifting_time(feet: StandingFeet, hit: Sequence[ImpactOracle], speed:
 
     The weight that a foot carries grows with the time, so bisection finds this time up to 5 %.
     """
+    contacts = _Contacts(feet, hit)
 
     def moves(time: float) -> bool:
-        impact = unilateral_impact(feet, hit, speed, time)
-        return impact is None or bool(impact.lifts or impact.slides)
+        # The largest pull is π/2 times its mean, so a single step with less weight tells whether a foot moves.
+        step = contacts.step(np.zeros(feet.M.shape[0]), speed, 0.0, 2 / np.pi * time)
+        return step is None or np.abs(feet.jacobian @ step[0]).max() > _MOVES * speed
 
     if moves(most):
         return np.inf
