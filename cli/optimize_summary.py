@@ -47,11 +47,11 @@ def announce(page: Page, prepared: Prepared) -> None:
 
 def summarize(page: Page, prepared: Prepared, solution: PostureSolution, document: dict[str, Any]) -> None:
     """Print the result: verdict, table of values before and after, certificate, trade-off and path."""
-    from impact_posture.output.quantity_table import quantity_rows
+    from impact_posture.output.quantity_table import answer_key, quantity_rows
     from impact_posture.posture.search.impact_notes import percent
 
-    initial, optimal = document["initial"], document["optimal"]
-    impact, blocks = prepared.impact, {"before": initial, "after": optimal}
+    initial, answer = document["initial"], document[answer_key(document)]
+    impact, blocks = prepared.impact, {"before": initial, "after": answer}
     page.line(document["verdict"]["line"], style="bold")
     page.line(document["verdict"]["minimized"])
     for line in document["verdict"]["advice"]:
@@ -59,7 +59,7 @@ def summarize(page: Page, prepared: Prepared, solution: PostureSolution, documen
     page.gap()
     rows = [
         (f"  {row.key}", number(row.before), number(row.after), row.unit, row.meaning)
-        for row in quantity_rows(impact, initial, optimal)
+        for row in quantity_rows(impact, initial, answer)
     ]
     page.table(("", *blocks, "unit", "meaning"), rows, right=(1, 2))
     frames = contact_names(impact.objective.contacts)
@@ -67,8 +67,11 @@ def summarize(page: Page, prepared: Prepared, solution: PostureSolution, documen
     worst_tables(page, frames, blocks)
     page.gap()
     worst_lines(page, frames, blocks)
-    _holding(page, initial["holding"], optimal["holding"])
+    _holding(page, initial["holding"], answer["holding"])
     free = f"{solution.redundancy} degree{'' if solution.redundancy == 1 else 's'} of freedom"
+    if "reachable" in document:
+        share = percent(1 - answer["objective"] / initial["objective"])
+        page.line(f"reduction {share} where the path ends; the next lines are about the optimum")
     page.line(f"reduction {percent(solution.reduction)}; {free} left by the constraints")
     if "robustness" in document:
         page.line(document["robustness"]["line"])
@@ -159,7 +162,8 @@ def _path(page: Page, path: dict[str, Any]) -> None:
         )
     else:
         page.line("path: the start is the optimum" if path["found"] else "path: none leads away from the start")
-    if path["reason"]:
+    # The verdict states why a path does not reach the optimum.
+    if path["found"] and path["reason"]:
         page.line(f"  {path['reason']}")
 
 

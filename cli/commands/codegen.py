@@ -83,7 +83,7 @@ def codegen(
         title = f"{objectives[0].robot.name} at {where}", f"objective {objectives[0].name}"
         rows = [
             ("functions", ", ".join(written.functions)),
-            ("posture", "the result's optimum" if optimum is not None else "none"),
+            ("posture", "of the result" if optimum is not None else "none"),
             ("numbers", written.manifest["real"]),
             ("stack", f"at most {written.manifest['stack_bytes']} bytes"),
             *([("choice", choice)] if choice else []),

@@ -78,12 +78,12 @@ def verify(
 
 
 def _of_result(folder: Path) -> ResolvedImpact:
-    """Return the impact of a result folder, at its optimal posture."""
+    """Return the impact of a result folder, at the posture of its posture.json."""
     from impact_posture.impact.resolved_impact import ResolvedImpact
     from impact_posture.output.result_reader import load_view
 
     view = load_view(folder)
-    return ResolvedImpact(view.objective, view.q_optimal, "the result's optimum", view.speed, view.restitution)
+    return ResolvedImpact(view.objective, view.q_optimal, "the posture of the result", view.speed, view.restitution)
 
 
 def _cells(row: VerificationRow) -> tuple[str, ...]:

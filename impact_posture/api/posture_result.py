@@ -70,6 +70,11 @@ class PostureResult:
         return self.solution.initial
 
     @property
+    def answer(self) -> Array:
+        """The posture of ``posture.json``, shape (nq,): ``q``, or the end of a path that does not reach ``q``."""
+        return self.q if self.motion is None or self.motion.found else self.motion.q[-1]
+
+    @property
     def reduction(self) -> float:
         """``1 − objective(q)/objective(initial)``."""
         return self.solution.reduction
@@ -93,8 +98,8 @@ class PostureResult:
     @cached_property
     def _postures(self) -> SolvedPostures:
         solution, mapped = self.solution, None if self.global_search is None else self.global_search.map
-        path = null_space_path(solution.problem, solution.initial, solution.q)
-        return SolvedPostures(solution.initial, solution.q, path, self.document, mapped)
+        path = null_space_path(solution.problem, solution.initial, self.answer)
+        return SolvedPostures(solution.initial, self.answer, path, self.document, mapped)
 
     @property
     def _prepared(self) -> Prepared:
@@ -139,7 +144,8 @@ class PostureResult:
         """Return this result with a path from the start to the optimum, timed within the robot's limits.
 
         See :func:`~impact_posture.path.posture_path.posture_path`.  If no path leads to the
-        best optimum, paths to the other optima are tried.  A search without ``finish_all`` may not find all optima.
+        best optimum, paths to the other optima are tried, and :attr:`answer` is the posture where the path ends.  A
+        search without ``finish_all`` may not find all optima.
 
         Args:
             seed: Seed of the sampling planner.
@@ -187,7 +193,7 @@ class PostureResult:
             write_json(folder / "result.json", self.document)
             arrays = result_arrays(self.solution, postures.path, self.tradeoff, postures.mapped)
             np.savez_compressed(folder / "result.npz", **arrays)  # type: ignore[arg-type]
-            write_json(folder / "posture.json", write_posture(prepared.impact.robot, postures.optimal))
+            write_json(folder / "posture.json", write_posture(prepared.impact.robot, postures.answer))
             (folder / "problem.toml").write_text(dump_settings(resolved_settings(prepared)), encoding="utf-8")
             if self.motion is not None:
                 from impact_posture.path.path_files import write_path
@@ -210,11 +216,11 @@ class PostureResult:
 
     @checked
     def export(self, out: str | Path, *, build: bool = True, **options: Any) -> Export:
-        """Write C code like :meth:`ImpactObjective.export`, with the optimal posture as a constant."""
+        """Write C code like :meth:`ImpactObjective.export`, with :attr:`answer` as a constant."""
         from impact_posture.codegen.export import write_export
 
         objective = self.problem.problem.impact
-        return write_export([objective], Path(out), posture=self.q, build=build, **options)
+        return write_export([objective], Path(out), posture=self.answer, build=build, **options)
 
 
 @checked

@@ -35,6 +35,11 @@ def quantities(metric: Metric) -> list[tuple[str, str, str]]:
     ]
 
 
+def answer_key(document: dict[str, Any]) -> str:
+    """Return the key of a ``result.json`` that describes the posture of ``posture.json``."""
+    return "reachable" if "reachable" in document else "optimal"
+
+
 def quantity_rows(impact: ResolvedImpact, initial: dict[str, Any], optimal: dict[str, Any]) -> list[QuantityRow]:
     """Return the rows of the table before and after.
 

@@ -107,8 +107,8 @@ def _export(folder: Path, prepared: Prepared, postures: SolvedPostures) -> Writt
 
     code, impact, compiler_error = folder / "c", prepared.impact, ""
     code.mkdir()
-    squeezed = compression(impact.objective, postures.optimal, impact.speed, impact.contact_stiffness)
-    write = partial(export, impact.objective, code, posture=postures.optimal, compression=squeezed)
+    squeezed = compression(impact.objective, postures.answer, impact.speed, impact.contact_stiffness)
+    write = partial(export, impact.objective, code, posture=postures.answer, compression=squeezed)
     try:
         exported = write()
     except CompilerError as error:

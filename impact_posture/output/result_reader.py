@@ -13,6 +13,7 @@ import numpy as np
 
 from impact_posture.config.problem_settings import Against
 from impact_posture.errors import SpecError, shown
+from impact_posture.output.quantity_table import answer_key
 from impact_posture.posture.analysis.result_document import SCHEMA
 from impact_posture.posture.formulation.problem_file import Prepared, prepare, read_settings
 from impact_posture.posture.manifold.null_space_path import NullSpacePath
@@ -37,14 +38,14 @@ class SolvedPostures:
 
     Attributes:
         initial: Initial posture, shape (nq,).
-        optimal: Optimal posture, shape (nq,).
+        answer: Posture of ``posture.json``, shape (nq,): the optimum, or the posture where a path to it ends.
         path: Null-space path between both postures.
         document: Content of ``result.json``.
         mapped: Map of the self-motion manifold; ``None`` if it was not computed.
     """
 
     initial: Array
-    optimal: Array
+    answer: Array
     path: NullSpacePath
     document: dict[str, Any]
     mapped: SelfMotionMap | None
@@ -94,11 +95,11 @@ def load_result(folder: Path) -> tuple[Prepared, ResultView, dict[str, Any]]:
             fault = f"was made with another model of {robot.name} (sha256 {recorded[:12]}…)"
             hint = "run optimize again, or use the URDF and armature of that result"
             raise SpecError(fault, where=str(folder), hint=hint)
-        initial, optimal = (
+        initial, answer = (
             robot.check_posture(document[key]["q"], limits=False, where=f"{folder / 'result.json'}: {key}.q")
-            for key in ("initial", "optimal")
+            for key in ("initial", answer_key(document))
         )
-        postures = SolvedPostures(initial, optimal, path, document, mapped)
+        postures = SolvedPostures(initial, answer, path, document, mapped)
         return prepared, result_view(prepared, postures, motion_of(folder, document, robot)), document
     except _BROKEN as error:
         raise _broken(folder, error) from None
@@ -130,12 +131,12 @@ def result_view(prepared: Prepared, postures: SolvedPostures, motion: PosturePat
     return ResultView(
         objective=impact.objective,
         q_initial=postures.initial,
-        q_optimal=postures.optimal,
+        q_optimal=postures.answer,
         speed=impact.speed,
         restitution=impact.restitution,
         path=postures.path,
         tradeoff=_tradeoff_data(document.get("tradeoff", []), document.get("tradeoff_against", "distance")),
-        collisions=_collisions(prepared, postures.initial, postures.optimal),
+        collisions=_collisions(prepared, postures.initial, postures.answer),
         depths=() if around is None else tuple(around.depth(c) for c in impact.objective.contacts),
         pushed=prepared.problem.requirements.contact_pose == "free",
         motion=motion,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -13,11 +14,13 @@ import pytest
 import yaml
 
 import impact_posture as ip
+from impact_posture.output.result_reader import load_view
 from impact_posture.path.path_files import positions, read_path, write_path
 from impact_posture.path.posture_path import PosturePath, posture_path
 from impact_posture.posture.formulation.problem_file import prepare
 from impact_posture.posture.search.multistart import solve
 from impact_posture.robot.robot import Robot
+from tests.path.test_path import assembled
 from tests.support.arms import Z, arm
 from tests.support.command import refused, run
 from tests.support.helpers import robot
@@ -177,3 +180,57 @@ def test_without_the_extra_the_command_stops_before_it_solves(tmp_path: Path) ->
     done = run(*command, cwd=tmp_path, prepare=hide)
     refused(done, 1, "the extra 'path': toppra", "not installed; pip install 'impact-posture[path]'")
     assert not done.stdout and not list(tmp_path.iterdir())
+
+
+def crank(folder: Path) -> Path:
+    """Write a planar linkage with its tip at (0.5, 0), whose crank can turn fully (0.1 + 0.5 < 0.4 + 0.4).
+
+    The start has one sign of the elbow, the optimum the other.  No motion that holds the tip joins them.
+    """
+    parts, parent, at = ['<robot name="crank"><link name="base"/>'], "base", 0.0
+    for k, rod in enumerate((0.1, 0.4, 0.4)):
+        parts.append(
+            f'<joint name="joint_{k}" type="revolute"><parent link="{parent}"/><child link="link_{k}"/>'
+            f'<origin xyz="{at} 0 0"/><axis xyz="0 0 1"/><limit lower="-3.1" upper="3.1" effort="5" velocity="9"/>'
+            f'</joint><link name="link_{k}"><inertial><origin xyz="{rod / 2} 0 0"/><mass value="0.2"/>'
+            '<inertia ixx="1e-3" iyy="1e-3" izz="1e-3" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+        )
+        parent, at = f"link_{k}", rod
+    tip = f'<origin xyz="{at} 0 0"/></joint><link name="tip"/></robot>'
+    parts.append(f'<joint name="tool" type="fixed"><parent link="{parent}"/><child link="tip"/>{tip}')
+    (folder / "crank.urdf").write_text("".join(parts), encoding="utf-8")
+    joints = ", ".join(f"joint_{k} = {value}" for k, value in enumerate(assembled(0.3, 1.0)))
+    postures = f'default_posture = "up"\n[postures.up]\njoints = {{ {joints} }}\n'
+    (folder / "robot.toml").write_text(f'{postures}[contact]\nframe = "tip"\n', encoding="utf-8")
+    return folder / "crank.urdf"
+
+
+def test_without_a_path_to_the_optimum_the_answer_is_the_posture_where_the_path_ends(tmp_path: Path) -> None:
+    options = "--armature none --normal 0.6 0.8 0 --contact-pose position --path --no-collision --jobs 1 --out out"
+    done = run("optimize", crank(tmp_path), *options.split(), cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    text = " ".join(done.stdout.split())
+    document = json.loads((tmp_path / "out" / "result.json").read_text())
+    posture = json.loads((tmp_path / "out" / "posture.json").read_text())["q"]
+    path, reachable, optimal = document["path"], document["reachable"], document["optimal"]
+    assert not path["found"] and posture == path["q"] == reachable["q"] != optimal["q"]
+    assert optimal["objective"] == document["solver"]["optima"][0]["objective"] < 0.9 * reachable["objective"]
+    assert reachable["objective"] == pytest.approx(path["objective"]) and "attainable_speed" in reachable
+    # The verdict states this first, and its numbers are of the reachable posture.
+    first = "posture.json is not the optimum but the posture where the path ends: no path to the optimum exists"
+    verdict = document["verdict"]
+    assert verdict["line"].startswith(f"verdict: {first}") and verdict["conditions"][0]["key"] == "path"
+    assert f"verdict: {first}" in text and text.index(first) < text.index("m/s with friction")
+    assert verdict["after"]["impulse"] == reachable["jump"]["coulomb"]["normal_impulse"]
+    assert verdict["after"]["impulse"] != pytest.approx(optimal["jump"]["coulomb"]["normal_impulse"], rel=1e-3)
+    share = 1 - reachable["objective"] / document["initial"]["objective"]
+    assert f"reduction {100 * share:.1f}% where the path ends; the next lines are about the optimum" in text
+    # The C code, also when it is written again, has the posture of posture.json.
+    written = run("codegen", "out", "--out", "again", cwd=tmp_path)
+    assert written.returncode == 0, written.stderr
+    for source in (tmp_path / "out" / "c", tmp_path / "again"):
+        (code,) = (file.read_text() for file in source.glob("*.c") if "_posture[" in file.read_text())
+        (numbers,) = re.findall(r"_posture\[\d+\] = \{([^}]*)\}", code)
+        assert [float(number) for number in numbers.split(",") if number.strip()] == pytest.approx(posture, rel=1e-15)
+    # A later command reads the same posture from the folder.
+    assert load_view(tmp_path / "out").q_optimal.tolist() == posture

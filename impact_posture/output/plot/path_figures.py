@@ -63,7 +63,8 @@ def path_figure(view: ResultView) -> Figure:
     with framed(*header_lines(view), 3.1, [share_notes("along the path", path)]) as (figure, body):
         axes = body.subplots()
         drawn = draw_shares(axes, path.s, path)
-        for word, s, align in (("start", path.s[0], "left"), ("optimum", path.s[-1], "right")):
+        end = "optimum" if view.motion is None or view.motion.found else "end of the path"
+        for word, s, align in (("start", path.s[0], "left"), (end, path.s[-1], "right")):
             axes.axvline(s, **_MARK)
             look = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points", "ha": align, "size": LEGEND}
             axes.annotate(word, (s, 1.0), (0, 3), **look)

@@ -14,7 +14,7 @@ from impact_posture.impact.evaluation.coulomb_jump import coulomb_jump, coulomb_
 from impact_posture.impact.evaluation.velocity_jump import normal_jump
 from impact_posture.impact.impact_contact import point_on
 from impact_posture.output.plot.result_view import ALONE, SEPARATOR, ResultView, header_lines, number
-from impact_posture.output.quantity_table import QuantityRow, quantities, quantity_rows
+from impact_posture.output.quantity_table import QuantityRow, answer_key, quantities, quantity_rows
 from impact_posture.output.report.drawn_robot import draw_robot
 from impact_posture.output.report.report_page import Content, Table, write_page
 from impact_posture.output.report.report_scene import Curve, ReportScene, Track, impact_curves
@@ -165,7 +165,8 @@ def _content(folder: Path, prepared: Prepared, view: ResultView, document: dict[
 
 def _before_and_after(prepared: Prepared, document: dict[str, Any]) -> Iterator[Table]:
     """Yield a table for the first contact with the objective, and a table for each other contact."""
-    blocks, contacts = [document[key] for key in ("initial", "optimal")], prepared.impact.objective.contacts
+    blocks = [document[key] for key in ("initial", answer_key(document))]
+    contacts = prepared.impact.objective.contacts
     for k, contact in enumerate(contacts):
         if k == 0:
             rows = quantity_rows(prepared.impact, *blocks)

@@ -1,4 +1,4 @@
-"""Warnings about an optimal posture that cannot be held or crosses a surface."""
+"""Warnings about an optimal or reachable posture that cannot be held or crosses a surface."""
 
 from __future__ import annotations
 
@@ -13,23 +13,25 @@ from impact_posture.system.arrays import Array
 _BEHIND = 0.01
 
 
-def posture_warnings(prepared: Prepared, initial: Array, q: Array, holding: HoldingForces | None) -> list[str]:
-    """Return warnings about holding forces, surface and ground for the optimal posture.
+def posture_warnings(
+    prepared: Prepared, initial: Array, q: Array, holding: HoldingForces | None, name: str = "optimal"
+) -> list[str]:
+    """Return warnings about holding forces, surface and ground for a posture ``q``, with its ``name`` in the texts.
 
-    ``holding`` are the forces that hold the optimal posture; ``None`` if unknown.
+    ``holding`` are the forces that hold this posture; ``None`` if unknown.
     """
     verb = "hold" if prepared.impact.robot.spec.propulsion is None else "hover in"
     loads = holding.violations() if holding else []
-    held = [f"the robot cannot {verb} the optimal posture: {violation}" for violation in loads]
+    held = [f"the robot cannot {verb} the {name} posture: {violation}" for violation in loads]
     if not prepared.impact.early_touches(initial):
         held += [
-            f"in the optimal posture, {touch.fact}: give `offset` {touch.offset}, or `contact_pose` full"
+            f"in the {name} posture, {touch.fact}: give `offset` {touch.offset}, or `contact_pose` full"
             for touch in prepared.impact.early_touches(q)
         ]
-    return [*held, *_surface_warnings(prepared, initial, q), *_ground_warnings(prepared, q)]
+    return [*held, *_surface_warnings(prepared, initial, q, name), *_ground_warnings(prepared, q, name)]
 
 
-def _surface_warnings(prepared: Prepared, initial: Array, q: Array) -> list[str]:
+def _surface_warnings(prepared: Prepared, initial: Array, q: Array, posture: str) -> list[str]:
     """Warn about joints or links that lie behind the contact plane; no constraint keeps them in front of it."""
     requirements = prepared.problem.requirements
     # With a free contact pose, an object pushes the robot, so there is no surface.
@@ -45,8 +47,8 @@ def _surface_warnings(prepared: Prepared, initial: Array, q: Array) -> list[str]
     new = [name for name in after if name not in before]
     if new:
         lines.append(
-            f"the optimal posture brings {_named(new)} behind the plane of the surface: no constraint prevents this; "
-            "bound the base or the joints if the surface reaches that far"
+            f"the {posture} posture brings {_named(new)} behind the plane of the surface: no constraint prevents "
+            "this; bound the base or the joints if the surface reaches that far"
         )
     return lines
 
@@ -64,7 +66,7 @@ def _behind(prepared: Prepared, q: Array) -> list[str]:
     ]
 
 
-def _ground_warnings(prepared: Prepared, q: Array) -> list[str]:
+def _ground_warnings(prepared: Prepared, q: Array, posture: str) -> list[str]:
     """Warn about joints or links that lie below the lowest foot; no constraint keeps them above flat ground."""
     robot, supports = prepared.impact.robot, prepared.impact.supports
     if not supports:
@@ -73,8 +75,8 @@ def _ground_warnings(prepared: Prepared, q: Array) -> list[str]:
     ground = min(numeric.placement(point_on(robot, s.frame, s.offset)).translation[2] for s in supports)
     below = [name for _, name, origin in _origins(prepared, numeric) if origin[2] < ground - _BEHIND]
     text = (
-        f"the optimal posture has {_named(below)} below the lowest foot: no constraint keeps them above the ground; "
-        "narrow their limits (robot.toml [limits.position]) or stay nearer with `regularization`"
+        f"the {posture} posture has {_named(below)} below the lowest foot: no constraint keeps them above the "
+        "ground; narrow their limits (robot.toml [limits.position]) or stay nearer with `regularization`"
     )
     return [text] if below else []
 

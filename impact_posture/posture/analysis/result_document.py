@@ -45,28 +45,38 @@ def result_document(
 ) -> dict[str, object]:
     """Return the content of ``result.json``; the last four arguments add a block each if they are not ``None``."""
     impact, around = prepared.impact, prepared.problem.surroundings
-    initial, optimal = impact.evaluate(solution.initial), impact.evaluate(solution.q)
+    postures = {"initial": solution.initial, "optimal": solution.q}
+    no_path = ""
+    if path is not None and not path["found"]:
+        postures["reachable"], no_path = np.array(path["q"]), str(path["reason"])
+    evaluations = {name: impact.evaluate(q) for name, q in postures.items()}
     loads = load_cases(impact.objective, solution.initial, prepared.problem.requirements)
-    before, after = (loads.holding(q) for q in (solution.initial, solution.q))
+    holding = {name: loads.holding(q) for name, q in postures.items()}
     approach = AttainableSpeed(impact.robot, impact.objective, prepared.problem.requirements)
-    attainable = [approach.reached(q) for q in (solution.initial, solution.q)]
+    attainable = {name: approach.reached(q) for name, q in postures.items()}
+    blocks = {
+        name: {
+            **evaluation.to_dict(),
+            "holding": None if (held := holding[name]) is None else held.to_dict(),
+            "attainable_speed": attainable[name],
+        }
+        for name, evaluation in evaluations.items()
+    }
+    # The posture of posture.json, to which the verdict refers.
+    answer = list(postures)[-1]
+    known = Circumstances(attainable[answer], solution.moved, no_path)
     fault = [solution.compiler_fault] if solution.compiler_fault else []
-    at_posture = posture_warnings(prepared, solution.initial, solution.q, after)
-    warnings = (*prepared.warnings, *initial.warnings, *optimal.warnings, *fault, *at_posture)
+    at_posture = posture_warnings(prepared, solution.initial, postures[answer], holding[answer], answer)
+    told = (warning for evaluation in evaluations.values() for warning in evaluation.warnings)
+    warnings = (*prepared.warnings, *told, *fault, *at_posture)
     curve = {} if tradeoff is None else {"tradeoff": tradeoff.to_list(), "tradeoff_against": tradeoff.against}
     return {
         "schema": SCHEMA,
-        "verdict": verdict(impact, initial, optimal, Circumstances(attainable[1], solution.moved)).to_dict(),
+        "verdict": verdict(impact, evaluations["initial"], evaluations[answer], known).to_dict(),
         **impact.to_dict(solution.initial),
         "constraints": prepared.problem.describe(),
-        "initial": {
-            "given_q": prepared.problem.given.tolist(),
-            "moved": solution.moved,
-            **initial.to_dict(),
-            "holding": before and before.to_dict(),
-            "attainable_speed": attainable[0],
-        },
-        "optimal": {**optimal.to_dict(), "holding": after and after.to_dict(), "attainable_speed": attainable[1]},
+        **blocks,
+        "initial": {"given_q": prepared.problem.given.tolist(), "moved": solution.moved, **blocks["initial"]},
         "reduction": solution.reduction,
         **({} if robustness is None else {"robustness": robustness.to_dict()}),
         "redundancy": solution.redundancy,

@@ -22,7 +22,7 @@ class Condition:
     """One condition of a verdict.
 
     Attributes:
-        key: ``arrival``, ``singular``, ``feet``, ``contact point`` or ``start``.
+        key: ``path``, ``arrival``, ``singular``, ``feet``, ``contact point`` or ``start``.
         line: The condition in words, without a full stop.
         hint: What the user can do; empty if there is nothing to do.
         refutes: Whether the verdict has no meaning, because the condition does not hold.
@@ -46,10 +46,12 @@ class Circumstances:
         attainable: Highest speed at which the joints can bring the contact to the surface in the optimal posture,
             m/s; ``None`` if unknown or unbounded.
         moved: Distance from the given to the initial posture, rad mixed with m.
+        no_path: Why no path to the optimum was found, and where the path ends; empty if it ends at the optimum.
     """
 
     attainable: float | None = None
     moved: float = 0.0
+    no_path: str = ""
 
 
 def conditions(
@@ -57,7 +59,13 @@ def conditions(
 ) -> tuple[Condition, ...]:
     """Return the conditions of the verdict on the posture of ``after``, the gravest first."""
     parts = _singular(after), _feet(before, after), _touch(impact, after), _start(known)
-    return (*_arrival(impact, known), *chain.from_iterable(parts))
+    return (*_path(known), *_arrival(impact, known), *chain.from_iterable(parts))
+
+
+def _path(known: Circumstances) -> Iterator[Condition]:
+    if known.no_path:
+        line = f"posture.json is not the optimum but the posture where the path ends: {known.no_path}"
+        yield Condition("path", line, "another `posture` to start from may have a path to the optimum")
 
 
 def _arrival(impact: ResolvedImpact, known: Circumstances) -> Iterator[Condition]:
