@@ -124,7 +124,8 @@ def _which_stick(dropped: Sequence[Dropped], rows: Sequence[Row]) -> Iterator[st
         for part in (held := row.split()):
             cells += [str(len(part.outcomes)), str(part.slid), _ratio(part.ratios("sticking"))]
             if part is held[0]:
-                cells.append(f"{max((o.deviation('sticking') for o in part.outcomes), default=np.nan):.1%}")
+                errors = [o.deviation("sticking") for o in part.outcomes]
+                cells.append(f"{max(errors):.1%}" if errors else "–")
         body.append(cells)
     yield from table([*_CONE.split("|"), "jump: (1+e)v√S"], body)
     yield from ("", "### MuJoCo's own friction", "")
