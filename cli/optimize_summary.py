@@ -102,6 +102,7 @@ def summarize(page: Page, prepared: Prepared, solution: PostureSolution, documen
         + (f"{left} could not become the best (--finish-all); " if left else "")
         + f"optima: {optima}{more}"
     )
+    page.line(document["search"]["line"])
     if "global" in document:
         page.line(document["global"]["line"])
     if "tradeoff" in document:

@@ -13,7 +13,7 @@ import numpy as np
 from impact_posture.api.posture_problem import PostureProblem
 from impact_posture.config.checked import checked
 from impact_posture.config.demand import OneOrMore, ZeroOrMore
-from impact_posture.config.problem_settings import STARTS, TRADEOFF_POINTS, Against, Search
+from impact_posture.config.problem_settings import SCREENED, STARTS, TRADEOFF_POINTS, Against, Search
 from impact_posture.errors import Infeasible, InputError
 from impact_posture.output.result_folder import FORMATS, Written, finish_result
 from impact_posture.output.result_reader import SolvedPostures, result_view
@@ -227,23 +227,26 @@ class PostureResult:
 def optimize(
     problem: PostureProblem,
     *,
-    starts: OneOrMore = STARTS,
+    starts: OneOrMore | None = None,
     seed: ZeroOrMore = 0,
     jobs: OneOrMore = 2,
     compile: CompileMode = "auto",
-    search: Search = "multistart",
+    search: Search = "adaptive",
     progress: Progress | None = None,
     finish_all: bool = False,
 ) -> PostureResult:
-    """Search from many starts for the posture with the smallest objective, and check its optimality.
+    """Search from many postures for the posture with the smallest objective, and check its optimality.
 
     Args:
         problem: The problem.
-        starts: Number of starts.  The first is the given posture, the others are random feasible postures.
+        starts: Most random postures that the search screens, by default 1024; for the search ``multistart`` and for
+            problems that cannot be screened, the number of starts, by default 16, of which the first is the given
+            posture and the others are random feasible postures.
         seed: Seed of the random starts.
         jobs: Number of parallel processes.
         compile: When to compile the program: ``auto`` (if it saves time), ``always`` or ``never``.
-        search: ``multistart``, or ``global`` (:func:`~impact_posture.posture.search.global_search.search_globally`).
+        search: ``adaptive`` (:mod:`~impact_posture.posture.search.screening`), ``multistart``, or ``global``, which
+            continues after ``adaptive`` (:func:`~impact_posture.posture.search.global_search.search_globally`).
         progress: Function that is called after each start with the numbers of finished and of all starts.
         finish_all: Also finish starts that can no longer become the best.  The search ``global`` always finishes all
             starts.
@@ -257,16 +260,17 @@ def optimize(
         check_searchable(problem.problem)
     try:
         solved = solve_robustly(
-            problem.problem, starts=starts, seed=seed, jobs=jobs, compile=compile, progress=progress,
+            problem.problem, starts=starts or STARTS, seed=seed, jobs=jobs, compile=compile, progress=progress,
             finish_all=finish_all or search == "global",
+            screened=0 if search == "multistart" else starts or SCREENED,
         )  # fmt: skip
     except Infeasible as error:
         if problem.prepared is not None:
-            explain_force_bound(error, problem.prepared, starts=starts, seed=seed, jobs=jobs, compile=compile)
+            explain_force_bound(error, problem.prepared, starts=starts or STARTS, seed=seed, jobs=jobs, compile=compile)
         raise
-    if search == "multistart":
+    if search != "global":
         return PostureResult(problem, solved.solution, solved.robustness)
-    best = search_globally(solved.solution, seed=seed, jobs=jobs, compile=compile, progress=progress)
+    best = search_globally(solved.solution, seed=seed, jobs=jobs, compile=compile)
     robustness = solved.robustness and compare_variants(
         best.solution, [variant.q for variant in solved.robustness.model_variants], seed
     )

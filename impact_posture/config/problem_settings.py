@@ -46,7 +46,7 @@ ContactPose = Literal["full", "position", "aligned", "free", "box"]
 BaseMode = Literal["free", "level", "fixed", "box"]
 SupportKind = Literal["point", "surface"]
 Against = Literal["distance", "force"]
-Search = Literal["multistart", "global"]
+Search = Literal["adaptive", "multistart", "global"]
 JointModel = Literal["reflected", "link", "locked", "elastic"]
 TransmissionKind = Literal["rigid", "elastic", "locked"]
 
@@ -60,8 +60,10 @@ MATERIALS = {"steel": (200e9, 0.28), "wood": (11.5e9, 0.3), "rubber": (0.03e9, 0
 CLEARANCE, PATCH = 0.001, 0.3
 # Default friction coefficient (Coulomb).
 FRICTION = Unstated(0.7)
-# Default number of starts; number of bounds if --tradeoff is given without a number.
-STARTS, TRADEOFF_POINTS = 16, 16
+# Default number of starts of a multi-start search, and most random postures that the adaptive search screens.
+STARTS, SCREENED = 16, 1024
+# Number of bounds if --tradeoff is given without a number.
+TRADEOFF_POINTS = 16
 # Default approach speed (m/s) and coefficient of restitution of predicted jumps.
 SPEED, RESTITUTION = Unstated(1.0), 0.0
 
@@ -264,9 +266,12 @@ class ProblemSettings(ImpactSettings):
         False, "Find a timed path from the start to the optimum, on which all constraints hold.", TASK
     )
     search: Search = setting(
-        "multistart", "multistart; or global, which adds a map of self-motions or basin hopping.", SEARCH
+        "adaptive", "adaptive; multistart; or global, which adds a map of one or two degrees of freedom.", SEARCH
     )
-    starts: OneOrMore = setting(STARTS, "Number of starting points of the search.", SEARCH)
+    starts: OneOrMore | None = setting(
+        None, "Most random postures that the search screens, or number of starts of multistart.", SEARCH,
+        words=f"{SCREENED}, multistart {STARTS}",
+    )  # fmt: skip
     finish_all: bool = setting(
         False, "Also finish starts that can no longer become the best; lists all optima.", SEARCH
     )

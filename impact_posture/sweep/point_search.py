@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from impact_posture.config.problem_settings import ProblemSettings
+from impact_posture.config.problem_settings import STARTS, ProblemSettings
 from impact_posture.errors import ImpactPostureError, Infeasible, SolverFailed
 from impact_posture.posture.formulation.build_problem import retarget
 from impact_posture.posture.manifold.feasible_start import FEASIBLE, Projector, random_posture
@@ -109,7 +109,7 @@ def search(walk: Walk, place: Place, guesses: Sequence[Start], beside: float = 0
     If these starts lead to different optima, random starts are added.  ``beside`` is the smallest violation at
     infeasible neighbors, or 0 if a neighbor has an optimum.  If it is positive, the point is probably infeasible.
     """
-    attempt = _Attempt(walk, place, walk.settings.starts - 1)
+    attempt = _Attempt(walk, place, (walk.settings.starts or STARTS) - 1)
     try:
         if not beside and (result := attempt.certified(guesses, rounds=_UNSURE)) is not None:
             return result
@@ -191,7 +191,12 @@ class _Attempt:
         settings = self._walk.settings
         try:
             solution = solve(
-                self.problem, starts=settings.starts, seed=settings.seed, jobs=1, compile="never", guesses=[guess]
+                self.problem,
+                starts=settings.starts or STARTS,
+                seed=settings.seed,
+                jobs=1,
+                compile="never",
+                guesses=[guess],
             )
         except (Infeasible, SolverFailed) as error:
             self.fault = error.what

@@ -203,9 +203,11 @@ def read_sweep(path: Path) -> Sweep:
     axes = tuple(Axis(name, _checked(name, values[name], problem | first, f"{path}: grid")) for name in inner)
     for name in outer:
         _checked(name, values[name], problem | first, f"{path}: grid")
-    if first_settings.tradeoff or first_settings.path or first_settings.search != "multistart":
+    if first_settings.tradeoff or first_settings.path or first_settings.search == "global":
         raise SpecError(
-            "a sweep does not support `tradeoff`, `path` and `search`", where=where, hint="remove these keys"
+            "a sweep does not support `tradeoff`, `path` and the search `global`",
+            where=where,
+            hint="remove these keys",
         )
     # A speed of the grid must not look like a stated speed, which would select the objective.
     stated = {name: value for name, value in (problem | first).items() if name != "speed" or "speed" not in first}

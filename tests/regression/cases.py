@@ -6,7 +6,7 @@ import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
-from impact_posture.config.problem_settings import ProblemSettings
+from impact_posture.config.problem_settings import SCREENED, ProblemSettings
 from impact_posture.posture.formulation.problem_file import Prepared, prepare
 from impact_posture.posture.search.multistart import PostureSolution, solve
 from tests.support.settings import make_settings
@@ -52,7 +52,7 @@ class Case:
         """Solve the problem with the defaults of the command."""
         prepared = prepare(self.settings)
         settings = prepared.settings
-        return prepared, solve(prepared.problem, starts=settings.starts, seed=settings.seed)
+        return prepared, solve(prepared.problem, seed=settings.seed, screened=SCREENED)
 
 
 CASES = (

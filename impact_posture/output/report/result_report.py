@@ -156,6 +156,8 @@ def _content(folder: Path, prepared: Prepared, view: ResultView, document: dict[
         notes=(
             f"{solver['certified_starts']} of {solver['starts']} starts ended at a certified posture."
             + (f" {dominated} were stopped early, because they could not become the best." if dominated else ""),
+            # Results of earlier versions do not have this block.
+            *([document["search"]["line"]] if "search" in document else []),
             f"{document['redundancy']} degrees of freedom are left by the constraints at the optimum.",
             *document["constraints"], *active, *document["notes"], *document["warnings"],
         ),

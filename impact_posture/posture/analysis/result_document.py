@@ -88,6 +88,7 @@ def result_document(
             "seed": prepared.settings.seed,
             "optima": [json_block(optimum) for optimum in solution.optima],
         },
+        "search": solution.estimate.to_dict(),
         **({} if global_search is None else {"global": global_search.to_dict()}),
         **curve,
         **({} if path is None else {"path": path}),

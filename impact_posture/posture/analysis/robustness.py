@@ -136,10 +136,12 @@ def solve_robustly(
     compile: CompileMode = "auto",
     progress: Progress | None = None,
     finish_all: bool = False,
+    screened: int = 0,
 ) -> RobustSolution:
     """Solve the problem for each model variant alone, then for all; if there are no variants, solve it once.
 
-    The search for the robust optimum starts from the optima of the variants and from ``starts`` other postures.
+    The search for the robust optimum starts from the optima of the variants and from ``starts`` other postures, or
+    from the best of at most ``screened`` random postures.
 
     Raises:
         Infeasible, SolverFailed: See :func:`~impact_posture.posture.search.multistart.solve`.
@@ -147,8 +149,9 @@ def solve_robustly(
     given, wanted = problem.given, problem.requirements
     if not (isinstance(problem.objective, WorstCaseObjective) and problem.objective.model_variants):
         solution = solve(
-            problem, starts=starts, seed=seed, jobs=jobs, compile=compile, progress=progress, finish_all=finish_all
-        )
+            problem, starts=starts, seed=seed, jobs=jobs, compile=compile, progress=progress, finish_all=finish_all,
+            screened=screened,
+        )  # fmt: skip
         return RobustSolution(solution, None)
     # A problem is built for each variant, because support impulses and the center of mass depend on the model.
     alone = [
@@ -165,7 +168,7 @@ def solve_robustly(
         count = starts + len(guesses)
         return solve(
             posed, starts=count, seed=seed, jobs=jobs, compile=compile, progress=advance, guesses=guesses,
-            finish_all=finish_all,
+            finish_all=finish_all, screened=screened,
         )  # fmt: skip
 
     optima = [_optimum(partial(run, member, (), k)) for k, member in enumerate(alone)]

@@ -1,7 +1,7 @@
 """The constraint manifold of a posture problem, evaluated at many postures at once.
 
-The functions of the program evaluate one posture at a time.  Here, CasADi evaluates a batch of postures, and NumPy
-solves the small linear systems of the batch together.  A posture of talos takes about 0.1 ms.
+The functions of the program evaluate one posture at a time.  Here, a batch of postures is evaluated, and NumPy solves
+the small linear systems of the batch together.  A posture of talos takes about 0.1 ms.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.spatial import quaternion_matrix
 from impact_posture.dynamics.tree import Tree
 from impact_posture.posture.constraints.constraint import ExpressionConstraint
+from impact_posture.posture.manifold.batch_function import BatchFunction
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem, held_rows
 from impact_posture.system.arrays import Array
 
@@ -25,6 +26,8 @@ _CONVERGED = 1e-10
 # Share of the trace that is added to the diagonal of a matrix that may be singular.
 _ROUNDING = 1e-13
 _LONGEST_STEP = 0.5
+# Weight of the squared violation of an inequality in the merit of a posture, 1/m² or 1/rad².
+_PENALTY = 200.0
 
 
 @dataclass(frozen=True)
@@ -57,10 +60,11 @@ class ConstraintManifold:
         equal = ca.vertcat(ca.SX(0, 1), *[c.symbolic(tree, ca.SX(ca.DM(c.parameters))) for c in equalities])
         self._inequalities = [c for c in problem.constraints if c not in equalities]
         jacobian = ca.vertcat(ca.jacobian(equal, x) @ motion, held)
-        self._equalities = _function([x], [ca.vertcat(equal, ca.SX(len(held), 1)), jacobian])
+        self._equalities = BatchFunction([x], [ca.vertcat(equal, ca.SX(len(held), 1)), jacobian])
         objective, normal = problem.impact.gradient_fun(), ca.DM(problem.impact.contact.normal)
-        self._objective = _function([x], list(objective(tree.q, normal)))
-        self._moved = _function([x, v], [_normalized(self.chart, x + motion @ v)])
+        self._objective = BatchFunction([x], list(objective(tree.q, normal)))
+        self._penalty = self._penalty_function(tree, motion, x)
+        self._moved = BatchFunction([x, v], [_normalized(self.chart, x + motion @ v)])
         self._turning = np.zeros(self.chart.nx, dtype=bool)
         self.lower, self.upper = problem.lower.copy(), problem.upper.copy()
         for slot in self.chart.slots:
@@ -73,13 +77,40 @@ class ConstraintManifold:
 
     def equalities(self, x: Array) -> tuple[Array, Array]:
         """Return ``c``, shape (N, m), and its tangent Jacobian, shape (N, m, nv)."""
-        value, jacobian = _call(self._equalities, x)
+        value, jacobian = self._equalities(x)
         return value[:, :, 0], jacobian
 
     def objective(self, x: Array) -> tuple[Array, Array]:
         """Return the objective, shape (N,), and its tangent gradient, shape (N, nv)."""
-        value, gradient = _call(self._objective, x)
+        value, gradient = self._objective(x)
         return value[:, 0, 0], gradient[:, :, 0]
+
+    def merit(self, x: Array) -> tuple[Array, Array]:
+        """Return ``ln f + μ Σ e²``, shape (N,), and its tangent gradient, shape (N, nv).
+
+        ``f`` is the objective, and ``e`` are the violations of the inequalities that are expressions of the posture.
+        The value is not finite where the objective is not defined.
+        """
+        value, gradient = self.objective(x)
+        with np.errstate(all="ignore"):
+            value, gradient = np.log(value), gradient / value[:, None]
+        if self._penalty is not None:
+            penalty, slope = self._penalty(x)
+            value, gradient = value + penalty[:, 0, 0], gradient + slope[:, :, 0]
+        return value, gradient
+
+    def _penalty_function(self, tree: Tree, motion: ca.SX, x: ca.SX) -> BatchFunction | None:
+        terms = ca.SX(0)
+        for constraint in self._inequalities:
+            if isinstance(constraint, ExpressionConstraint):
+                value = constraint.symbolic(tree, ca.SX(ca.DM(constraint.parameters)))
+                for bounds, sign in ((constraint.lower, -1.0), (constraint.upper, 1.0)):
+                    rows = np.flatnonzero(np.isfinite(bounds)).tolist()
+                    excess = ca.fmax(sign * (value[rows] - ca.DM(bounds[rows])), 0)
+                    terms += _PENALTY * ca.dot(excess, excess)
+        if terms.is_zero():
+            return None
+        return BatchFunction([x], [terms, motion.T @ ca.gradient(terms, x)])
 
     def distance_to_feasible(self, x: Array) -> Array:
         """Return the first-order distance to the set that satisfies limits and inequalities, shape (N,)."""
@@ -102,7 +133,7 @@ class ConstraintManifold:
 
         The motion of a floating base is accurate to first order.
         """
-        moved = _call(self._moved, x, v)[0][:, :, 0]
+        moved = self._moved(x, v)[0][:, :, 0]
         turns = np.where(self._turning, np.floor((moved - self._middle + np.pi) / (2 * np.pi)), 0.0)
         return np.asarray(moved - 2 * np.pi * turns)
 
@@ -144,30 +175,18 @@ class ConstraintManifold:
         return self.chart.to_q(x)
 
 
-def _function(inputs: list[ca.SX], outputs: list[ca.SX]) -> ca.Function:
-    return ca.Function("batch", inputs, [ca.densify(output) for output in outputs], {"cse": True})
-
-
-def _call(function: ca.Function, *inputs: Array) -> list[Array]:
-    """Call a function on each row of the inputs; the first axis of each output is the posture."""
-    count = len(inputs[0])
-    shapes = [function.size_out(i) for i in range(function.n_out())]
-    if not count:
-        return [np.zeros((0, *shape)) for shape in shapes]
-    outputs = function.call([ca.DM(np.ascontiguousarray(value.T)) for value in inputs])
-    return [
-        np.asarray(value, dtype=float).reshape(shape[0], count, shape[1]).transpose(1, 0, 2)
-        for value, shape in zip(outputs, shapes, strict=True)
-    ]
-
-
-def _least_norm(jacobian: Array, value: Array) -> Array:
-    """Return the steps of least norm with ``J v = c``, shortened to the longest step, shape (N, nv)."""
+def right_inverse(jacobian: Array) -> Array:
+    """Return ``Jᵀ(JJᵀ)⁻¹`` for each Jacobian, shape (N, nv, m)."""
     gram = jacobian @ jacobian.transpose(0, 2, 1)
     rows = np.arange(gram.shape[1])
     # The matrix may be singular: rows can be duplicates, and rows of a planar arm can be zero.
     gram[:, rows, rows] += _ROUNDING * np.maximum(1.0, np.trace(gram, axis1=1, axis2=2))[:, None]
-    step = (jacobian.transpose(0, 2, 1) @ np.linalg.solve(gram, value[:, :, None]))[:, :, 0]
+    return np.asarray(jacobian.transpose(0, 2, 1) @ np.linalg.inv(gram))
+
+
+def _least_norm(jacobian: Array, value: Array) -> Array:
+    """Return the steps of least norm with ``J v = c``, shortened to the longest step, shape (N, nv)."""
+    step = (right_inverse(jacobian) @ value[:, :, None])[:, :, 0]
     length = np.linalg.norm(step, axis=1, keepdims=True)
     return np.asarray(step * np.minimum(1.0, _LONGEST_STEP / np.maximum(length, 1e-300)))
 

@@ -1,10 +1,8 @@
-"""Global search: a complete map for one or two degrees of freedom, and basin hopping for more.
+"""Global search: a complete map after the adaptive search if one or two degrees of freedom are left.
 
 The map (:mod:`impact_posture.posture.manifold.self_motion`) bounds how much lower than the best value the objective
-can be. Basin hopping gives random values to some joints of the best posture and solves from there (D. J. Wales and J.
-P. K. Doye, "Global optimization by basin-hopping", J. Phys. Chem. A 1997).  Many optima differ in a few joints only.
-The objective at a start hardly predicts the objective at its end (``make study-global``), so starts are not chosen by
-their objective.
+can be.  With more degrees of freedom, the adaptive search (:mod:`impact_posture.posture.search.screening`) already
+contains the basin hopping.
 """
 
 from __future__ import annotations
@@ -19,28 +17,24 @@ from numpy.typing import NDArray
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import InputError, SolverFailed
 from impact_posture.posture.manifold.constraint_manifold import ConstraintManifold
-from impact_posture.posture.manifold.feasible_start import FEASIBLE, Projector, random_posture
+from impact_posture.posture.manifold.feasible_start import FEASIBLE
 from impact_posture.posture.manifold.optimality_bound import OptimalityBound, bound_objective
 from impact_posture.posture.manifold.self_motion import SelfMotion, map_self_motion
 from impact_posture.posture.program.compiled_solver import CompileMode
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem, equality_jacobian, rank
 from impact_posture.posture.program.ipopt import one_blas_thread
-from impact_posture.posture.search.growing_search import Progress
 from impact_posture.posture.search.multistart import PostureSolution, solve
 from impact_posture.system.arrays import Array
 
-# Number of rounds of hops. In each round, the number of hops equals the number of starts of the multi-start search.
-HOPS_PER_START = 3
-# Shares of the joints to which a hop gives random values.
-_REDRAWN = (0.1, 0.25, 0.5)
 # An objective is better than another if it is lower by more than this share.
 _BETTER = 1e-6
 # A start missed the best posture if the objective at its end is more than this share above the best objective.
 _MISSED = 1e-3
 _KEYS = ("redundancy", "improvement", "missed_rate", "unseen_share", "estimated_optima", "hops", "word", "line")
-# Attributes of a solution that describe the multi-start search.
+# Attributes of a solution that describe the search before the map.
 _OF_THE_STARTS = (
-    "optima", "starts", "feasible_starts", "certified_starts", "dominated_starts", "solve_time_s", "build_time_s",
+    "optima", "estimate", "starts", "feasible_starts", "certified_starts", "dominated_starts", "solve_time_s",
+    "build_time_s",
 )  # fmt: skip
 
 
@@ -56,7 +50,7 @@ class SelfMotionMap:
         objective: Objective at each node, shape (N,).
         feasible: Whether each node satisfies the joint limits and inequalities, shape (N,).
         start, optimum: Index of the node nearest to the initial and to the best posture, shape (1,).
-        ends: Index of the node nearest to each optimum of the multi-start search, shape (M,).
+        ends: Index of the node nearest to each optimum of the search before the map, shape (M,).
     """
 
     q: Array
@@ -75,13 +69,13 @@ class GlobalSearch:
 
     Attributes:
         redundancy: Number of degrees of freedom that remain under the equality constraints.
-        improvement: Relative decrease of the objective below the best objective of the multi-start search.
+        improvement: Relative decrease of the objective below the best objective before the map.
         missed_rate: Share of the certified starts whose final objective is more than 0.1 % above the best objective.
-        unseen_share: Estimated share of further starts that would end in an optimum not seen yet.
-        hops: Number of hops; 0 if the manifold was mapped.
-        motion: The mapped self-motion manifold; ``None`` after basin hopping.
-        bound: Lower bound of the objective on the mapped manifold; ``None`` after basin hopping.
-        map: Data of the mapped manifold for figures; ``None`` after basin hopping.
+        unseen_share, estimated_optima, hops: As in the estimate of the solution
+            (:class:`~impact_posture.posture.search.unseen_optima.SearchEstimate`).
+        motion: The mapped self-motion manifold; ``None`` if more than two degrees of freedom are left.
+        bound: Lower bound of the objective on the mapped manifold; ``None`` without a map.
+        map: Data of the mapped manifold for figures; ``None`` without a map.
     """
 
     redundancy: int
@@ -99,11 +93,7 @@ class GlobalSearch:
         """One sentence that describes the result."""
         missed = f"{100 * self.missed_rate:.0f} % of the starts"
         if self.motion is None or self.bound is None:
-            return (
-                f"{self.hops} hops from the best posture lower the objective by {100 * self.improvement:.2g} %; "
-                f"{missed} missed it, about {100 * self.unseen_share:.0f} % of further starts would find an "
-                f"optimum not seen yet, of about {self.estimated_optima:.0f}"
-            )
+            return f"no map: {self.redundancy} degrees of freedom are left; {missed} missed the best posture"
         count = len(self.motion.components)
         pieces = "1 component" if count == 1 else f"{count} components"
         return (
@@ -163,12 +153,10 @@ def search_globally(
     seed: int = 0,
     jobs: int = 2,
     compile: CompileMode = "auto",
-    progress: Progress | None = None,
 ) -> GlobalSolution:
-    """Continue from the solution of a multi-start search whose problem passes :func:`check_searchable`.
+    """Continue from the solution of a search whose problem passes :func:`check_searchable`.
 
-    ``seed`` is the seed of the random postures.  ``progress`` is called with the numbers of finished and planned
-    solves.
+    ``seed`` is the seed of the random postures.
     """
     problem = solution.problem
     # The rank drops at a singular posture, so the larger of both ranks gives the dimension of the manifold.
@@ -176,52 +164,36 @@ def search_globally(
     ranks = [rank(equality_jacobian(problem, numeric.at(q))) for q in (solution.initial, solution.q)]
     redundancy = problem.robot.nv - max(ranks)
     solve_from = partial(_improved, seed=seed, jobs=jobs, compile=compile)
-    if redundancy in (1, 2):
-        better, motion, bound, drawn = _mapped(solution, redundancy, seed, solve_from)
-        return GlobalSolution(better, GlobalSearch(redundancy, *_compared(solution, better), 0, motion, bound, drawn))
-    better, hops = solution, HOPS_PER_START * solution.starts
-    projector, rng = Projector(problem), np.random.default_rng([seed, 1])
-    for number in range(HOPS_PER_START):
-        better = solve_from(better, [_redrawn(projector, better.q, rng) for _ in range(solution.starts)])
-        if progress is not None:
-            progress((number + 1) * solution.starts, hops)
-    return GlobalSolution(better, GlobalSearch(redundancy, *_compared(solution, better), hops))
+    if redundancy not in (1, 2):
+        return GlobalSolution(solution, GlobalSearch(redundancy, *_compared(solution, solution)))
+    better, motion, bound, drawn = _mapped(solution, redundancy, seed, solve_from)
+    return GlobalSolution(better, GlobalSearch(redundancy, *_compared(solution, better), motion, bound, drawn))
 
 
-def _compared(before: PostureSolution, after: PostureSolution) -> tuple[float, float, float, float]:
-    """Return improvement, missed rate, unseen share and estimated number of optima of :class:`GlobalSearch`."""
-    value, hits = before.problem.objective.value, [optimum.hits for optimum in before.optima]
-    best = value(after.q)
+def _compared(before: PostureSolution, after: PostureSolution) -> tuple[float, float, float, float, int]:
+    """Return improvement, missed rate and the estimates of :class:`GlobalSearch`."""
+    value, estimate = before.problem.objective.value, before.estimate
+    best, starts = value(after.q), sum(optimum.hits for optimum in before.optima)
     near = sum(optimum.hits for optimum in before.optima if optimum.objective <= best * (1 + _MISSED))
-    return max(0.0, 1 - best / value(before.q)), 1 - near / sum(hits), unseen_share(hits), estimated_optima(hits)
+    missed = 1 - near / max(starts, 1)
+    return (
+        max(0.0, 1 - best / value(before.q)), missed, estimate.unseen_share, estimate.estimated_optima, estimate.hops
+    )  # fmt: skip
 
 
 def _improved(
-    before: PostureSolution, guesses: Sequence[Array | None], *, seed: int, jobs: int, compile: CompileMode
+    before: PostureSolution, guesses: Sequence[Array], *, seed: int, jobs: int, compile: CompileMode
 ) -> PostureSolution:
-    """Solve from ``guesses``; return the better of both solutions, with the multi-start statistics of ``before``."""
-    known = [q for q in guesses if q is not None]
+    """Solve from ``guesses``; return the better of both solutions, with the statistics of ``before``."""
     try:
-        count = 1 + len(known)
-        after = solve(before.problem, starts=count, seed=seed, jobs=jobs, compile=compile, guesses=known)
+        count = 1 + len(guesses)
+        after = solve(before.problem, starts=count, seed=seed, jobs=jobs, compile=compile, guesses=guesses)
     except SolverFailed:
         return before
     value = before.problem.objective.value
     if not value(after.q) < value(before.q) * (1 - _BETTER):
         return before
     return replace(after, **{key: getattr(before, key) for key in _OF_THE_STARTS})
-
-
-def _redrawn(projector: Projector, q: Array, rng: np.random.Generator) -> Array | None:
-    """Give random values to some joints and project the posture onto the constraints; ``None`` if that fails."""
-    chart = projector.chart
-    x, other = chart.to_x(q), chart.to_x(random_posture(projector.problem, chart, rng))
-    share = rng.choice(_REDRAWN)
-    for slot in chart.slots:
-        if slot.kind.family != "free-flyer" and rng.random() < share:
-            x[slot.x] = other[slot.x]
-    projection = projector.project(chart.to_q(x))
-    return projection.q if projection.violation <= FEASIBLE else None
 
 
 def _mapped(
@@ -260,22 +232,3 @@ def _mapped(
     )
     best = solution.problem.objective.value(better.q)
     return better, motion, replace(bound, best=best, lower=min(bound.lower, best)), drawn
-
-
-def unseen_share(hits: Sequence[int]) -> float:
-    """Estimate, from the hits of each optimum, the share of further starts that would end in an optimum not seen yet.
-
-    The Good–Turing estimate is the share of starts that ended in an optimum with only one hit (I. J. Good, "The
-    population frequencies of species and the estimation of population parameters", Biometrika 1953).
-    """
-    return sum(count == 1 for count in hits) / sum(hits)
-
-
-def estimated_optima(hits: Sequence[int]) -> float:
-    """Estimate the number of optima, seen and unseen, from the hits of each; the estimate tends to be too low.
-
-    This is the bias-corrected Chao1 estimate ``n + f₁(f₁ − 1)/(2(f₂ + 1))`` with the numbers ``f_k`` of optima with k
-    hits (A. Chao, "Nonparametric estimation of the number of classes in a population", Scand. J. Statist. 1984).
-    """
-    once, twice = (sum(count == k for count in hits) for k in (1, 2))
-    return len(hits) + once * (once - 1) / (2 * (twice + 1))

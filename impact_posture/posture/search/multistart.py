@@ -21,7 +21,9 @@ from impact_posture.posture.program.program_rows import ProgramRows
 from impact_posture.posture.search.growing_search import GrowingSearch, Progress, SolverRun
 from impact_posture.posture.search.impact_notes import notes_on_impacts
 from impact_posture.posture.search.initial_posture import initial_objective, initial_posture
+from impact_posture.posture.search.screening import screen, screenable
 from impact_posture.posture.search.start_draws import StartDraws
+from impact_posture.posture.search.unseen_optima import SearchEstimate
 from impact_posture.system.arrays import Array
 
 # Two final postures are the same optimum if their tangent distance and the relative difference of their objectives
@@ -53,6 +55,7 @@ class PostureSolution:
         q: The best certified posture, shape (nq,).
         redundancy: Number of degrees of freedom at ``q`` that remain under the equality constraints.
         optima: Distinct optima, best first.
+        estimate: What the search may have missed.
         feasible_starts: Number of starts that reached the constraints.
         certified_starts: Number of starts that ended at a certified posture where no original shapes touch.
         colliding_starts: Number of starts that ended at a certified posture where original shapes touch.
@@ -72,6 +75,7 @@ class PostureSolution:
     certificate: Certificate
     redundancy: int
     optima: tuple[Optimum, ...]
+    estimate: SearchEstimate
     starts: int
     feasible_starts: int
     certified_starts: int
@@ -104,12 +108,14 @@ def solve(
     progress: Progress | None = None,
     guesses: Sequence[Array] = (),
     finish_all: bool = False,
+    screened: int = 0,
 ) -> PostureSolution:
     """Solve from the given posture, from feasible ``guesses``, shape (nq,) each, and from random feasible postures.
 
     ``starts`` is the number of all starts, and ``seed`` the seed of the random postures.  ``progress`` is called with
     the numbers of finished starts and of all starts.  ``finish_all`` also finishes starts that can no longer become
-    the best.
+    the best.  If ``screened`` is not 0, at most this number of random postures is screened
+    (:mod:`impact_posture.posture.search.screening`), and the best are the starts, instead of random postures.
 
     Raises:
         Infeasible: No posture satisfies the constraints; the error names the conflicting constraints.
@@ -119,7 +125,13 @@ def solve(
     problem, initial = initial_posture(problem, seed, rows)
     scale = initial_objective(problem, initial)
     began = time.perf_counter()
-    draws = StartDraws(problem, (initial, *guesses), starts, seed)
+    known, hits, screening = (initial, *guesses), [1] * (1 + len(guesses)), None
+    if screened and screenable(problem):
+        screening = screen(problem, initial, screened, seed)
+        known, hits = (*known, *screening.guesses), [*hits, *screening.hits]
+        starts = len(known)
+    hits += [1] * (starts - len(hits))
+    draws = StartDraws(problem, known, starts, seed)
     search = GrowingSearch(problem, draws, scale, compile=compile, finish_all=finish_all, rows=rows)
     runs = search.run(jobs, progress)
     problem, nlp = search.problem, search.nlp
@@ -145,14 +157,25 @@ def solve(
         note = "no better posture found: the initial posture is already optimal for this impact, or nearly so"
         other = np.linalg.norm(wrapped_difference(problem, initial, q)) > SAME_POSTURE
         notes.append(f"{note}; the posture shown is another posture with equal objective" if other else note)
-    optima = distinct(problem, [(r.record.q, r.objective) for r in good if r.record is not None])
+    hits_of = {id(run): count for run, count in zip(runs, hits, strict=True)}
+    optima = distinct(
+        problem, [(r.record.q, r.objective) for r in good if r.record], [hits_of[id(r)] for r in good if r.record]
+    )
     notes += notes_on_impacts(problem.objective, initial, q)
     if touching:
         count = len(certified) - len(good)
         notes.append(f"{count} certified postures left out, because original shapes touch there: {touching}")
     dominated = sum(r.dominated for r in runs)
-    if hits_of_best(optima) == 1 and dominated + sum(o.hits for o in optima) >= _MANY:
-        notes.append("only one start ended at the best optimum: more `starts` may find a better one")
+    # Starts that did not end at a certified posture would lead elsewhere.
+    others = [1] * dominated if screening is None else [count for count in screening.others if count]
+    estimate = SearchEstimate.of(
+        "multistart" if screening is None else "adaptive",
+        [*(o.hits for o in optima), *others],
+        hits_of_best(optima),
+        0 if screening is None else screening.hops,
+    )
+    if estimate.hits_of_best <= 1 and estimate.starts >= _MANY:
+        notes.append("at most one start ended at the best optimum: more `starts` may find a better one")
     return PostureSolution(
         problem=problem,
         initial=initial,
@@ -161,6 +184,7 @@ def solve(
         certificate=certificate,
         redundancy=redundancy,
         optima=optima,
+        estimate=estimate,
         starts=starts,
         feasible_starts=sum(r.start is not None for r in runs),
         certified_starts=len(good),
@@ -199,17 +223,23 @@ def _without_collisions(problem: ConstrainedProblem, runs: list[SolverRun]) -> t
     return good, touching
 
 
-def distinct(problem: ConstrainedProblem, ends: list[tuple[Array, float]]) -> tuple[Optimum, ...]:
-    """Group final postures, given with their objectives, by optimum; the best objective comes first."""
+def distinct(
+    problem: ConstrainedProblem, ends: list[tuple[Array, float]], hits: Sequence[int] | None = None
+) -> tuple[Optimum, ...]:
+    """Group final postures, given with their objectives, by optimum; the best objective comes first.
+
+    ``hits`` is the number of starts that each posture stands for, by default one.
+    """
     optima: list[Optimum] = []
-    for q, objective in sorted(ends, key=lambda end: end[1]):
+    weighted = [(*end, count) for end, count in zip(ends, hits or [1] * len(ends), strict=True)]
+    for q, objective, count in sorted(weighted, key=lambda end: end[1]):
         for k, known in enumerate(optima):
             near = abs(objective - known.objective) <= _SAME_OBJECTIVE * max(abs(known.objective), 1e-300)
             if near and np.linalg.norm(wrapped_difference(problem, known.q, q)) < SAME_POSTURE:
-                optima[k] = replace(known, hits=known.hits + 1)
+                optima[k] = replace(known, hits=known.hits + count)
                 break
         else:
-            optima.append(Optimum(q, objective, 1))
+            optima.append(Optimum(q, objective, count))
     return tuple(optima)
 
 

@@ -1,0 +1,79 @@
+"""Estimate, from how often a search reached each optimum, what further starts would find."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+# If no start was alone at its optimum, at most this number of starts in N lead elsewhere, with a confidence of 95 %
+# (rule of three).
+_RULE_OF_THREE = 3
+
+
+@dataclass(frozen=True)
+class SearchEstimate:
+    """What a search reached, and what it may have missed.
+
+    Attributes:
+        method: ``adaptive`` or ``multistart``.
+        starts: Number of starts at random postures and at the given posture, without hops.
+        hops: Number of starts at changed postures of the best optima.
+        optima: Number of distinct optima that starts or hops reached.
+        hits_of_best: Number of starts that reached the best objective; 0 if only hops reached it.
+        unseen_share: Estimated share of further starts that would lead to an optimum not seen yet.
+        estimated_optima: Estimated number of optima, seen and unseen.
+    """
+
+    method: str
+    starts: int
+    hops: int
+    optima: int
+    hits_of_best: int
+    unseen_share: float
+    estimated_optima: float
+
+    @staticmethod
+    def of(method: str, hits: Sequence[int], hits_of_best: int, hops: int = 0) -> SearchEstimate:
+        """Estimate from the number of starts at each optimum; optima that only hops reached have no hits."""
+        starts = sum(hits)
+        return SearchEstimate(
+            method, starts, hops, len(hits), hits_of_best, unseen_share(hits), estimated_optima(hits)
+        )
+
+    @property
+    def line(self) -> str:
+        """One sentence for users."""
+        optima = "1 optimum" if self.optima == 1 else f"{self.optima} optima"
+        times = {0: "reached by hops only", 1: "hit once"}.get(self.hits_of_best, f"hit {self.hits_of_best} times")
+        most = min(1.0, _RULE_OF_THREE / max(self.starts, 1))
+        elsewhere = f"about {_percent(self.unseen_share)}" if self.unseen_share else f"fewer than {_percent(most)}"
+        hops = f" and {self.hops} hops" if self.hops else ""
+        starts = "1 start" if self.starts == 1 else f"{self.starts} starts"
+        return f"{starts}{hops}: {optima}, the best {times}; {elsewhere} of the starts would lead elsewhere"
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the block ``search`` of ``result.json``."""
+        return {**vars(self), "line": self.line}
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.{0 if share >= 0.1 else 1}f} %"
+
+
+def unseen_share(hits: Sequence[int]) -> float:
+    """Estimate, from the hits of each optimum, the share of further starts that would end in an optimum not seen yet.
+
+    The Good–Turing estimate is the share of starts that ended in an optimum with only one hit (I. J. Good, "The
+    population frequencies of species and the estimation of population parameters", Biometrika 1953).
+    """
+    return sum(count == 1 for count in hits) / max(sum(hits), 1)
+
+
+def estimated_optima(hits: Sequence[int]) -> float:
+    """Estimate the number of optima, seen and unseen, from the hits of each; the estimate tends to be too low.
+
+    This is the bias-corrected Chao1 estimate ``n + f₁(f₁ − 1)/(2(f₂ + 1))`` with the numbers ``f_k`` of optima with k
+    hits (A. Chao, "Nonparametric estimation of the number of classes in a population", Scand. J. Statist. 1984).
+    """
+    once, twice = (sum(count == k for count in hits) for k in (1, 2))
+    return len(hits) + once * (once - 1) / (2 * (twice + 1))

@@ -1,0 +1,219 @@
+"""The adaptive search: functions of a batch, descents, screening, and the sentence about what was not seen."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from docs.studies.cases import CASES
+from docs.studies.search_quality import random_arm
+from impact_posture.posture.formulation.problem_file import prepare
+from impact_posture.posture.manifold import batch_function
+from impact_posture.posture.manifold.batch_descent import BatchDescent, Ends
+from impact_posture.posture.manifold.batch_function import BatchFunction
+from impact_posture.posture.manifold.constraint_manifold import ConstraintManifold
+from impact_posture.posture.manifold.feasible_start import random_posture
+from impact_posture.posture.program.posture_nlp import build_nlp
+from impact_posture.posture.search.growing_search import run_start
+from impact_posture.posture.search.multistart import PostureSolution, solve
+from impact_posture.posture.search.screening import screen, screenable
+from impact_posture.posture.search.unseen_optima import SearchEstimate
+from tests.support.command import run
+from tests.support.settings import make_settings
+
+
+def postures(manifold: ConstraintManifold, count: int) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    drawn = [random_posture(manifold.problem, manifold.chart, rng) for _ in range(count)]
+    return np.array([manifold.chart.to_x(q) for q in drawn])
+
+
+def descended(manifold: ConstraintManifold, x: np.ndarray) -> Ends:
+    descent = BatchDescent(manifold)
+    descent.add(x, np.arange(len(x)))
+    ends = Ends(np.zeros((0, x.shape[1])), np.zeros(0), np.zeros(0, dtype=int))
+    while descent.active:
+        ends = ends.joined(descent.step())
+    return ends
+
+
+# ---- functions of a batch --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["tilthex_arm, cone 20°", "solo8, four feet, cone 20°", "solo12, two feet struck", "tilthex_arm, 6 models"],
+)
+def test_a_batch_equals_single_calls(name: str) -> None:
+    manifold = ConstraintManifold(CASES[name].problem())
+    # Two full runs of the operations, and a third with one posture.
+    x = postures(manifold, 2 * batch_function._WIDTH + 1)
+    for function in (manifold._objective, manifold._equalities):
+        assert function._operations is not None
+        for together, alone in zip(function(x), function._one_by_one((x,)), strict=True):
+            scale = np.nanmax(np.abs(alone), initial=1.0)
+            np.testing.assert_allclose(together, alone, rtol=1e-9, atol=1e-12 * scale)
+
+
+def test_a_batch_of_a_function_that_numpy_lacks_is_still_right() -> None:
+    x = ca.SX.sym("x", 2)
+    function = BatchFunction([x], [ca.vertcat(ca.erf(x[0]), ca.if_else(x[1] > 0, ca.sqrt(x[1]), 3))])
+    values = np.random.default_rng(0).normal(size=(100, 2))
+    assert function._operations is None
+    assert function(values)[0].shape == (100, 2, 1)
+    np.testing.assert_allclose(function(values)[0][:, 1, 0], np.where(values[:, 1] > 0, values[:, 1], 9.0) ** 0.5)
+
+
+def test_a_branch_that_is_not_taken_may_be_undefined() -> None:
+    x = ca.SX.sym("x")
+    values = np.linspace(-1, 1, 80)[:, None]
+    root = BatchFunction([x], [ca.if_else(x > 0, ca.sqrt(x), 0)])(values)[0][:, 0, 0]
+    np.testing.assert_allclose(root, np.sqrt(np.maximum(values[:, 0], 0)))
+
+
+# ---- descents --------------------------------------------------------------------------------------------------
+
+
+def test_the_merit_has_the_gradient_of_finite_differences() -> None:
+    problem = prepare(make_settings({"robot": "solo12", "normal": (1, 0, 0), "com": True})).problem
+    manifold, size = ConstraintManifold(problem), 1e-6
+    x = postures(manifold, 4)
+    gradient = manifold.merit(x)[1]
+    for k in range(manifold.chart.nv):
+        step = np.zeros((4, manifold.chart.nv))
+        step[:, k] = size
+        ahead, behind = manifold.merit(manifold.move(x, step))[0], manifold.merit(manifold.move(x, -step))[0]
+        np.testing.assert_allclose(gradient[:, k], (ahead - behind) / (2 * size), rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("number", [0, 5])
+def test_descents_end_near_optima_on_the_constraints(number: int) -> None:
+    problem = random_arm(number)
+    manifold = ConstraintManifold(problem)
+    x = manifold.project(postures(manifold, 80), within=True)
+    before = x.x[x.converged]
+    ends = descended(manifold, before)
+    assert len(ends.x) >= len(before) / 2
+    assert np.abs(manifold.equalities(ends.x)[0]).max() < 1e-4
+    assert (ends.x >= problem.lower - 1e-12).all() and (ends.x <= problem.upper + 1e-12).all()
+    assert (ends.merit <= manifold.merit(before)[0][ends.tag] + 1e-9).all()
+    assert np.median(manifold.merit(before)[0]) - np.median(ends.merit) > 0.5
+    # From most ends, a second descent cannot lower the merit by 1 %, and the best end is certified nearby.
+    again = descended(manifold, ends.x)
+    assert np.mean(ends.merit[again.tag] - again.merit < 0.01) > 0.8
+    nlp, best = build_nlp(problem, compile="never"), ends.merit.argmin()
+    record, certificate = run_start(nlp, manifold.to_q(ends.x[best]), problem.objective.value(problem.given))
+    assert certificate.holds()
+    assert np.log(problem.objective.value(record.q)) == pytest.approx(ends.merit[best], abs=0.01)
+
+
+def test_a_joint_that_is_held_does_not_move() -> None:
+    problem = prepare(
+        make_settings({"robot": "panda", "normal": (0, 0, 1), "contact_pose": "position", "hold": ("panda_joint2",)})
+    ).problem
+    manifold = ConstraintManifold(problem)
+    column = problem.robot.model.idx_vs[problem.robot.joint_id("panda_joint2")]
+    x = postures(manifold, 70)
+    start = manifold.chart.to_x(problem.given)[column]
+    x[:, column] = start
+    ends = descended(manifold, x)
+    assert len(ends.x) and np.abs(ends.x[:, column] - start).max() < 1e-9
+    assert np.ptp(ends.x, axis=0).max() > 0.1
+
+
+# ---- the search ------------------------------------------------------------------------------------------------
+
+
+def test_the_adaptive_search_reaches_what_sixteen_starts_miss() -> None:
+    problem = random_arm(1)
+    many = solve(problem, starts=200, seed=9, jobs=1, compile="never").optima[0].objective
+    few = solve(problem, jobs=1, compile="never")
+    adaptive = solve(problem, screened=1024, jobs=1, compile="never")
+    assert few.optima[0].objective > 1.1 * many
+    assert adaptive.optima[0].objective <= many * (1 + 1e-6) and adaptive.certificate.holds()
+    assert adaptive.estimate.method == "adaptive" and adaptive.estimate.hits_of_best >= 3
+    # The search stopped long before its limit.
+    assert adaptive.estimate.starts + adaptive.estimate.hops < 700
+
+
+def test_one_seed_gives_one_answer() -> None:
+    problem = random_arm(2)
+    first, again = (solve(problem, screened=200, seed=3, jobs=jobs, compile="never") for jobs in (1, 2))
+    np.testing.assert_array_equal(first.q, again.q)
+    assert first.estimate == again.estimate
+    other = solve(problem, screened=200, seed=4, jobs=1, compile="never")
+    assert other.estimate != first.estimate
+
+
+@pytest.mark.parametrize("most", [1, 40])
+def test_the_number_of_starts_limits_the_screening(most: int) -> None:
+    problem = random_arm(2)
+    screening = screen(problem, problem.given, most, 0)
+    assert sum(screening.hits) + sum(screening.others) + screening.hops <= most
+    solution = solve(problem, screened=most, jobs=1, compile="never")
+    assert solution.certificate.holds() and solution.starts == 1 + len(screening.guesses)
+
+
+def test_a_problem_that_cannot_be_screened_uses_random_starts() -> None:
+    problem = random_arm(0)
+    near = replace(problem, requirements=replace(problem.requirements, regularization=1.0))
+    assert screenable(problem) and not screenable(near)
+    solution = solve(near, starts=3, screened=500, jobs=1, compile="never")
+    assert solution.estimate.method == "multistart" and solution.starts == 3
+
+
+@pytest.mark.parametrize("robot, normal", [("go2", (-1, 0, 0)), ("hextilt", (0, 0, 1))])
+def test_collisions_and_loads_stay_excluded(robot: str, normal: tuple[float, float, float]) -> None:
+    problem = prepare(make_settings({"robot": robot, "normal": normal, "collision": True, "holdable": True})).problem
+    solution: PostureSolution = solve(problem, screened=128, jobs=1, compile="never")
+    assert solution.certificate.holds()
+    assert problem.surroundings is not None and not problem.surroundings.collisions(solution.q)
+    initial = problem.objective.value(solution.initial)
+    assert problem.objective.value(solution.q) <= initial * (1 + 1e-9)
+
+
+# ---- the estimate ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "hits, best, line",
+    [
+        ([4, 1, 15], 4, "20 starts: 3 optima, the best hit 4 times; about 5.0 % of the starts would lead elsewhere"),
+        ([20], 20, "20 starts: 1 optimum, the best hit 20 times; fewer than 15 % of the starts would lead elsewhere"),
+        ([1], 1, "1 start: 1 optimum, the best hit once; about 100 % of the starts would lead elsewhere"),
+    ],
+)
+def test_the_line_of_an_estimate(hits: list[int], best: int, line: str) -> None:
+    assert SearchEstimate.of("multistart", hits, best).line == line
+
+
+def test_an_optimum_of_hops_has_no_hits() -> None:
+    estimate = SearchEstimate.of("adaptive", [0, 3, 2], 0, hops=9)
+    assert estimate.line.startswith("5 starts and 9 hops: 3 optima, the best reached by hops only; fewer than 60 %")
+
+
+def test_every_answer_states_the_estimate(tmp_path: Path) -> None:
+    options = ("--normal", 0, 0, 1, "--jobs", 1, "--no-codegen", "--no-report", "--format", "png")
+    for name, more in (("adaptive", ("--starts", 40)), ("multistart", ("--search", "multistart", "--starts", 3))):
+        done = run("optimize", "tilthex_arm", *options, *more, "--out", name, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        block = json.loads((tmp_path / name / "result.json").read_text())["search"]
+        assert block["method"] == name and block["starts"] <= 40
+        assert block["line"] in " ".join(done.stdout.split())
+
+
+def test_full_turns_do_not_leave_the_limits() -> None:
+    problem = prepare(make_settings({"robot": "ur5", "normal": (0, 0, 1)})).problem
+    manifold = ConstraintManifold(problem)
+    ends = descended(manifold, postures(manifold, 70))
+    model = problem.robot.model
+    for posture in ends.x:
+        q = manifold.to_q(posture)
+        assert (q >= model.lowerPositionLimit - 1e-9).all() and (q <= model.upperPositionLimit + 1e-9).all()
+        assert pin.isNormalized(model, q)
