@@ -266,7 +266,7 @@ def optimize(
         )  # fmt: skip
     except Infeasible as error:
         if problem.prepared is not None:
-            explain_force_bound(error, problem.prepared, starts=starts or STARTS, seed=seed, jobs=jobs, compile=compile)
+            explain_force_bound(error, problem.prepared, starts=STARTS, seed=seed, jobs=jobs, compile=compile)
         raise
     if search != "global":
         return PostureResult(problem, solved.solution, solved.robustness)
