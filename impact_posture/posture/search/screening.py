@@ -153,7 +153,7 @@ class _Search:
 
 
 def _best_and_different(points: Array, count: int) -> list[int]:
-    """Return the first postures, then those of the better half that are farthest from all chosen ones."""
+    """Return the first postures, then postures of the better half that are farthest from all chosen postures."""
     chosen = list(range(min(len(points), count // 2)))
     half = np.arange(len(points)) < max(count, len(points) // 2)
     while len(chosen) < min(count, int(half.sum())):
