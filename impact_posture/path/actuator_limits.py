@@ -20,15 +20,15 @@ class ActuatorLimits:
     """Limits on the load ``M ν̇ + h`` of a motion.
 
     Motors, rotors and feet carry the load as in :class:`~impact_posture.posture.loads.equilibrium.Equilibrium`.
-    They are built from a posture with the feet in place, shape (nq,), and from the friction in the requirements.
-    ``names`` and ``kinds`` (``torque`` or ``thrust``) belong to the actuators with a limit.  ``missing`` says why the
-    limits of this robot are not known; it is empty if they are known.
+    The feet stay where they are at the posture ``q``, shape (nq,).  ``requirements`` contains the friction.
+    ``names`` and ``kinds`` are the names and types (``torque`` or ``thrust``) of the actuators with limits.
+    ``missing`` is the reason why limits of the robot are unknown; empty if all are known.
     """
 
     def __init__(self, objective: Objective, q: Array, requirements: Requirements) -> None:
         robot = objective.robot
         self._model = robot.model.copy()
-        # In a motion, the rotors move with their joints in every joint model.
+        # Motor rotors turn with their joints during a motion, so the armature counts in every joint model.
         self._model.armature = np.where(np.isfinite(robot.armature), robot.armature, 0.0)
         self._data = self._model.createData()
         loads = load_cases(objective, q, replace(requirements, hold_force=0.0))
@@ -45,10 +45,11 @@ class ActuatorLimits:
         return np.array(pin.rnea(self._model, self._data, q, v, a))
 
     def largest_rate(self, q: Array, rest: Array, dynamic: Array) -> float | None:
-        """Return the largest ``λ ≥ 0`` for which the limits allow the load ``rest + λ dynamic``; infinite if all do.
+        """Return the largest ``λ ≥ 0`` for which the limits allow the load ``rest + λ dynamic``, or infinity.
 
         A motion of duration ``T`` has the load of gravity plus ``1/T²`` times the dynamic load for ``T = 1 s``.  So
-        the result is ``1/T²`` of the fastest motion.  ``None`` if the limits do not even allow the load at rest.
+        the result is ``1/T²`` of the fastest motion.  Return ``None`` if the limits do not even allow the load at
+        rest.
         """
         if self._out_of_reach(rest):
             return None
@@ -58,7 +59,7 @@ class ActuatorLimits:
         """Return the signed shares of the limits that a load needs, in the order of ``names``.
 
         A share is 0 in the middle of the range of an actuator, and ±1 at its limits.  The largest share is as small
-        as possible.  ``None`` if rotors or friction do not allow the load.
+        as possible.  Return ``None`` if rotors or friction do not allow the load.
         """
         return None if self._out_of_reach(load) else self._equilibrium.shares(q, load)
 

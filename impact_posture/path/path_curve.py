@@ -22,26 +22,26 @@ if TYPE_CHECKING:
 
 # Largest permitted distance of the curve from the constraints, measured in the tangent space.
 DEVIATION = 1e-5
-# How often the number of knots may double; at corners of a path along bodies, each time halves the deviation.
+# Largest number of times that the number of knots is doubled.  At a corner, each doubling halves the deviation.
 _DOUBLINGS = 7
-# Knots of the projected spline for each knot of the spline.  They divide the distance from the constraints by 8⁴.
+# Number of knots of the projected spline per knot of the spline.  This factor divides the deviation by about 8⁴.
 _FINER = 8
 # Step of central differences along the curve, whose length is 1.
 _STEP = 1e-5
-# A knot is a corner if the curve bends this many times more there than at the median knot.
+# A knot is a corner if the second derivative of the spline there exceeds this multiple of the median over the knots.
 _SHARP = 5.0
-# Parts between two knots for the check of limits, at corners and elsewhere.
+# Number of parts between two knots for the check of limits: next to corners, and elsewhere.
 _AT_CORNERS, _BETWEEN = 8, 2
 
 
 class PathCurve:
     """The cubic spline ``q₀ ⊕ z(s)``, ``0 ≤ s ≤ 1``, through two or more postures, projected onto the equalities.
 
-    The projection is as smooth as the spline.  Inequalities and joint limits are not part of it, because the velocity
-    of a motion that follows them exactly jumps where it meets them.
+    The projected curve is as smooth as the spline.  It is not projected onto inequalities and joint limits, because
+    its velocity would jump where they become active.
 
-    ``s`` has the values at the postures, evenly by path length, and ``z`` their tangent coordinates at the first
-    posture, shape (n, nv).
+    ``s`` contains the values of the parameter at the postures, evenly spaced, shape (n,).  ``z`` contains the tangent
+    coordinates of the postures at the first posture, shape (n, nv).
     """
 
     def __init__(self, space: PathSpace, postures: Sequence[Array]) -> None:
@@ -73,18 +73,18 @@ class PathCurve:
         return np.concatenate([*parts, [1.0]])
 
     def at(self, z: Array) -> Array:
-        """Return the posture of tangent coordinates, ``q₀ ⊕ z``, shape (nq,)."""
+        """Return the posture ``q₀ ⊕ z``, shape (nq,)."""
         return np.asarray(pin.integrate(self._space.model, self._start, z))
 
     def moment(self, s: float) -> Moment:
-        """Return ``q(s)``, ``ν = dq/ds`` in the tangent space there, and ``dν/ds``."""
+        """Return ``q(s)``, ``ν = dq/ds`` in the tangent space at ``q``, and ``dν/ds``."""
         model, (z, dz, ddz) = self._space.model, (self._projected(s, order) for order in range(3))
         ahead, turn, behind = (pin.dIntegrate(model, self._start, z + x * dz, pin.ARG1) for x in (_STEP, 0.0, -_STEP))
         return self.at(z), turn @ dz, turn @ ddz + (ahead - behind) @ dz / (2 * _STEP)
 
     @cached_property
     def _projected(self) -> CubicSpline:
-        """The spline through postures of the first spline that are projected onto the equalities."""
+        """Spline through postures of :attr:`spline` after their projection onto the equalities."""
         from scipy.interpolate import CubicSpline
 
         problem, s = self._space.problem, np.linspace(0.0, 1.0, _FINER * (len(self.s) - 1) + 1)
@@ -103,7 +103,7 @@ class PathCurve:
         """Return the largest tangent distance of the curve from the constraints; infinite if a posture is not valid.
 
         The search stops at the first distance above ``DEVIATION``, because then the curve needs more knots anyway.
-        Between two checked postures, no frame moves more than the check distance.
+        Between two checked postures, no frame moves more than ``CHECK_DISTANCE``.
         """
         worst, before = 0.0, self.at(self.z[0])
         # The knots themselves are on the constraints.

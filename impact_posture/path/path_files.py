@@ -31,8 +31,9 @@ def write_path(folder: Path, robot: Robot, path: PosturePath) -> None:
     """Write ``path.csv``, ``path.npz`` and ``path.yaml`` into a folder.
 
     The rows of the CSV have the time ``t`` (s), positions ``q:…``, velocities ``v:…`` and accelerations ``a:…`` by
-    name.  A continuous joint is an angle without jumps.  The YAML is a ``trajectory_msgs/JointTrajectory``.  Between
-    two rows, the limits hold for the quintic polynomial that has the values of both rows.
+    name.  The angle of a continuous joint has no jumps at full turns.  The YAML is a
+    ``trajectory_msgs/JointTrajectory``.  Between two rows, the limits hold for the quintic polynomial that has the
+    values of both rows.
     """
     names, angles = positions(robot, path.q)
     columns = [printable(name) for name in robot.tangent_names]
@@ -64,7 +65,7 @@ def read_path(folder: Path, block: Mapping[str, Any], robot: Robot) -> PosturePa
         if arrays[key].shape != shape or not finite or (np.abs(arrays[key]) > _LARGEST).any():
             raise ValueError(f"'{key}' of path.npz does not fit the path of {robot.name}")
     if count == 0 or (np.diff(arrays["t"]) <= 0).any():
-        raise ValueError("the times of path.npz do not rise")
+        raise ValueError("the times of path.npz do not increase")
     return PosturePath(
         **{key: block[key] for key in _BLOCK},
         t=arrays["t"], q=arrays["q"], v=arrays["v"], a=arrays["a"],
@@ -76,7 +77,8 @@ def read_path(folder: Path, block: Mapping[str, Any], robot: Robot) -> PosturePa
 def positions(robot: Robot, q: Array) -> tuple[list[str], Array]:
     """Return names and values of the position coordinates along a path, shape (n, nx).
 
-    A continuous joint is one angle.  A floating base has its position (m) and its quaternion, scalar last.
+    A continuous joint has one coordinate, its angle.  A floating base has its position (m) and its quaternion, scalar
+    last.
     """
     chart, names = Chart(robot.model), []
     x = np.array([chart.to_x(posture) for posture in q])

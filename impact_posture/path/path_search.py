@@ -1,4 +1,4 @@
-"""Search a path on the constraints by walks and trees of walks, and shorten it."""
+"""Search for a path on the constraints with two trees of walks (:meth:`PathSpace.walk`), and shorten it."""
 
 from __future__ import annotations
 
@@ -14,20 +14,21 @@ from impact_posture.system.arrays import Array
 
 # Largest number of postures that the search pulls onto the constraints for a target.
 EFFORT = 5000
-# A path gets an elastic band if it is longer than the straight distance by more than the first share.  If it exceeds
-# the second share, it first gets shortcuts, whose walks cost more.
+# An elastic band shortens a path that is longer than the straight distance by more than the first share.  Shortcuts
+# first shorten a path that exceeds the second share; they need more time.
 _BENT, _DETOUR = 0.02, 0.2
 _SHORTCUTS = 24
-# Postures of the elastic bands, and sweeps over each.
+# Number of postures of each elastic band, and number of sweeps over a band.
 _BANDS, _SWEEPS = (9, 17, 33), 12
 
 
 @dataclass(frozen=True, eq=False)
 class Connection:
-    """Result of a search between two postures, by ``continuation`` (walks alone) or ``sampling``.
+    """Result of a search between two postures; ``method`` is ``continuation``, or ``sampling`` of random postures.
 
-    ``path`` has postures with valid motions between them; it is ``None`` if no path was found.  ``reached`` are all
-    postures that the search reached from the first.  ``proof`` says why no path exists, if this is known.
+    The motions between successive postures of ``path`` are valid; ``None`` means that the search failed.  ``reached``
+    contains all postures that the search reached from the start.  ``proof`` is the reason why no path exists; empty
+    if this is not proved.
     """
 
     path: list[Array] | None
@@ -66,14 +67,14 @@ class _Tree:
 
 
 def connect(space: PathSpace, start: Array, target: Array, seed: int = 0, effort: int = EFFORT) -> Connection:
-    """Search a path with two trees of walks, from the ends towards each other and towards random postures.
+    """Search for a path with two trees of walks, which grow from both ends towards each other and random postures.
 
     The method is CBiRRT (Berenson et al. 2009).  The planners of OMPL 2.0 on projected state spaces stop at
     inequalities, while these walks slide along them.  On a planar arm beside discs, OMPL found 5 of 18 paths in the
     time in which these trees found 18.
 
     Both ends, shape (nq,), must be valid.  The search ends after ``effort`` postures pulled onto the constraints.
-    This is a count and not a time, so that the result depends only on the seed.
+    The limit is a count and not a time, so the result depends only on the seed.
     """
     rng, chart = np.random.default_rng(seed), space.projector.chart
     first, second = _Tree(space, start), _Tree(space, target)
@@ -96,8 +97,9 @@ def shortened(space: PathSpace, postures: Sequence[Array], seed: int = 0) -> lis
     """Return a shorter and smoother path between the same ends, by shortcuts and then an elastic band.
 
     A shortcut is a walk between two postures of the path that is shorter than the path between them.  The elastic
-    band moves each posture to the middle of its neighbors and pulls it onto the constraints, with more and more
-    postures.  The result is the last band if its whole motion is valid.  An almost straight path does not change.
+    band moves each posture to the middle of its neighbors and pulls it onto the constraints.  Each further band has
+    more postures.  The result is the last band if its whole motion is valid.  An almost straight path does not
+    change.
     """
     path, rng = list(postures), np.random.default_rng(seed)
     straight = space.distance(path[0], path[-1])
@@ -122,7 +124,7 @@ def shortened(space: PathSpace, postures: Sequence[Array], seed: int = 0) -> lis
 
 
 def even(space: PathSpace, postures: Sequence[Array], count: int) -> list[Array]:
-    """Return ``count`` postures on the constraints that divide a path evenly, with both ends."""
+    """Return ``count`` postures on the constraints that divide a path evenly, including both ends."""
     lengths = np.array([space.distance(a, b) for a, b in pairwise(postures)])
     ends = np.concatenate([[0.0], np.cumsum(lengths)])
     divided = [postures[0]]

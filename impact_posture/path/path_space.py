@@ -21,16 +21,17 @@ CHECK_DISTANCE = 2e-2
 STEP = 0.05
 # A step is stuck if it comes nearer to its target by less than this share of its length.
 _PROGRESS = 0.05
-# Largest factor between the step on the constraints and the planned step.  A longer step jumps to another branch.
+# Largest ratio of the length of a step on the constraints to its planned length.  A longer step is a jump to another
+# branch of the constraints.
 _JUMP = 2.0
-# Number of translations, the first velocity entries of a joint, by joint family.
+# Joint family → number of translations, which are the first velocity entries of a joint.
 _SLIDING = {"free-flyer": 3, "planar": 2, "prismatic": 1, "translation": 3}
 
 
 class PathSpace:
     """Postures on the constraints and within the joint limits of a problem, and checked motions between them.
 
-    ``pulls`` counts the postures pulled onto the constraints so far, which measures the effort.
+    ``pulls`` is the number of postures that were pulled onto the constraints so far.
     """
 
     def __init__(self, problem: ConstrainedProblem) -> None:
@@ -74,22 +75,23 @@ class PathSpace:
         return projected if self.valid(projected) else None
 
     def size(self, step: Array) -> float:
-        """Return the size of a tangent step, which is at most 1 between two checked postures.
+        """Return the size of a tangent step.  Between two successive checked postures, the size is at most 1.
 
-        The size is 1 if a frame moves by the check distance, or if the tangent norm is two steps of a walk.  Without
-        inequalities, no constraint can be met between two postures, and only the norm counts.
+        The size is the larger of two ratios: the motion of a frame divided by :data:`CHECK_DISTANCE`, and the tangent
+        norm divided by two steps of a walk.  Without inequalities, only the second ratio counts.
         """
         moved = float(self._reach @ np.abs(step)) / CHECK_DISTANCE if self._inequalities else 0.0
         return max(moved, float(np.linalg.norm(step)) / (_JUMP * STEP))
 
     def checks(self, step: Array) -> int:
-        """Return the number of parts for the check of a tangent step; a part may double on the constraints."""
+        """Return into how many parts a check divides a tangent step; on the constraints, a part may get longer."""
         return max(1, int(np.ceil(_JUMP * self.size(step) - 1e-9)))
 
     def clear(self, start: Array, end: Array) -> bool:
         """Return whether the motion from ``start`` to ``end`` along the constraints is valid between its ends.
 
-        The check pulls postures of the straight motion onto the constraints.  A part of a size above 1 is blocked.
+        The check pulls postures of the straight motion onto the constraints.  The motion is invalid if two successive
+        postures differ by a step of a :meth:`size` above 1.
         """
         whole, q = self.difference(start, end), start
         parts = self.checks(whole)
@@ -106,14 +108,14 @@ class PathSpace:
         return all(map(self.valid, path)) and all(self.clear(a, b) for a, b in pairwise(path))
 
     def take(self, q: Array, step: Array) -> Array | None:
-        """Take a tangent step along the constraints; ``None`` if it is blocked or jumps to another branch."""
+        """Return the posture after a step along the constraints; ``None`` if it is invalid or on another branch."""
         moved = self.pulled(q, step)
         if moved is None or self.distance(q, moved) > _JUMP * float(np.linalg.norm(step)):
             return None
         return moved if self.clear(q, moved) else None
 
     def walk(self, start: Array, target: Array) -> list[Array]:
-        """Step from ``start`` towards ``target`` along the constraints, until no step comes nearer.
+        """Return postures from ``start`` towards ``target`` along the constraints, until no step comes nearer.
 
         The last posture is ``target`` itself if the walk reaches it.  Inequalities deflect the steps, because the
         postures are pulled onto them, too.
@@ -148,7 +150,7 @@ class PathSpace:
 
 
 def lever_arms(chart: Chart, model: pin.Model) -> Array:
-    """Return a bound on the motion of a frame per unit of each velocity entry, m/rad or 1, shape (nv,).
+    """Return an upper bound on the motion of any frame per unit of each velocity entry, m/rad or 1, shape (nv,).
 
     For a rotation, the bound is the length of the longest chain of placements from the joint to a frame behind it.
     No frame is farther from the axis.  Sliding joints on the chain add their largest travel.

@@ -15,18 +15,20 @@ from impact_posture.path.time_law import polynomial, stepped
 from impact_posture.path.timed_curve import SAMPLE_TIME, TimedCurve, moment, sampled
 from impact_posture.system.arrays import Array
 
-# Intervals of the time-optimal parametrization; within an interval, a limit may be exceeded by less than 1 %.
+# Number of intervals of the time-optimal parametrization.  Within an interval, a motion can exceed a limit by up to 1
+# %.
 _GRID = 400
-# Instants for the check of a scaled motion, besides places of its curve, and rows of the table that finds these.
+# Number of evenly spaced instants at which a scaled motion is checked, and number of rows of a table of ``s`` over
+# time.
 INSTANTS, _INVERSE = 61, 2001
-# Joint speed where the robot has no velocity limit, rad/s or m/s.
+# Velocity limit that is assumed for a joint without a velocity limit, rad/s or m/s.
 _DEFAULT_SPEED = 1.0
-# Least share of an active limit.
+# A limit is active if a motion needs more than this share of it.
 _ACTIVE = 0.98
 _ONE_AXIS = ("revolute", "continuous", "prismatic")
-# A time-optimal motion with a larger share of a limit at one of its points is not used.
+# A time-optimal motion is rejected if it needs more than this multiple of a limit.
 _EXCEEDED = 1.01
-# The smooth law 6 τ⁵ − 15 τ⁴ + 10 τ³, highest power first.
+# Coefficients of 6 τ⁵ − 15 τ⁴ + 10 τ³, highest power first.
 _SMOOTH = np.array([6.0, -15.0, 10.0, 0.0, 0.0, 0.0])
 
 
@@ -73,9 +75,9 @@ def scaled(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedC
     """Return the fastest motion of the form ``s(t) = 10 τ³ − 15 τ⁴ + 6 τ⁵``, ``τ = t/T``, within all known limits.
 
     The load of a motion is the load of gravity plus ``1/T²`` times a load that does not depend on ``T``.  So a linear
-    program gives the smallest ``T`` at each instant, and the motion takes the largest of these.  The instants are
-    spread evenly, plus those at the places of the curve, most of which are at corners.  If a curve has corners and
-    :func:`slowed` takes less time, the result is the slowed motion.
+    program gives the smallest ``T`` at each instant, and the motion takes the largest of these durations.  Some
+    instants are evenly spaced, others are at ``curve.places``, most of which are at corners.  If a curve has corners
+    and :func:`slowed` takes less time, the result is the slowed motion.
     """
     fine, law = np.linspace(0.0, 1.0, _INVERSE), polynomial(_SMOOTH, 1.0)
     notes, tau = [], np.concatenate([np.linspace(0.0, 1.0, INSTANTS), np.interp(curve.places, law.at(fine)[0], fine)])
@@ -136,7 +138,7 @@ def timed(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedCu
 
 
 def _exceeded(space: PathSpace, motion: TimedCurve, limits: ActuatorLimits) -> float:
-    """Return the largest share of a limit that a motion of a fixed base needs, at its rows and between them."""
+    """Return the largest share of a limit that a motion with a fixed base needs, at its rows and between them."""
     largest = 0.0
     for q, v, a in map(motion.rows.at, motion.instants):
         used = limits.shares(q, limits.load(q, v, a))
@@ -147,11 +149,11 @@ def _exceeded(space: PathSpace, motion: TimedCurve, limits: ActuatorLimits) -> f
 
 @dataclass(frozen=True, eq=False)
 class LimitUse:
-    """Largest shares of the limits that a motion needs at each time, shape (m,); 1 is at a limit.
+    """Largest shares of the limits that a motion needs at each time, shape (m,); 1 means that it reaches a limit.
 
     The share of a thrust is its distance from the middle of its range, divided by half the range.  Unknown torques
-    and thrusts are NaN.  ``largest`` has the largest shares, their actuators, and the active limit, as in
-    ``result.json``.
+    and thrusts are NaN.  ``largest`` contains the largest shares, the actuators that need them, and the active limit,
+    as in ``result.json``.
     """
 
     at: Array
@@ -170,8 +172,8 @@ def limit_use(space: PathSpace, motion: TimedCurve, limits: ActuatorLimits) -> L
     robot, t = space.problem.robot, motion.instants
     moments = [motion.rows.at(time) for time in t]
     if robot.floating:
-        # Each instant needs a linear program. Only some are checked: evenly spread ones, and those with large
-        # accelerations.
+        # Each instant needs a linear program.  Check only evenly spaced instants, and the instants of largest
+        # acceleration.
         even = [round(k) for k in np.linspace(0, len(t) - 1, INSTANTS)]
         bent = np.argsort([-np.abs(a).max() for _, _, a in moments], kind="stable")[:INSTANTS].tolist()
         every = sorted({*even, *bent})

@@ -21,7 +21,7 @@ from impact_posture.system.arrays import Array
 
 # Largest number of optima to try, best first.
 _OPTIMA = 5
-# Tangent length below which a path is not a motion, and relative gain that is too small to matter.
+# A shorter path counts as no motion.  A posture with a smaller relative gain counts as no better.
 _NO_MOTION, _NO_GAIN = 1e-6, 1e-6
 # Largest number of reached postures to evaluate if no optimum is reached.
 _MOST_VISITED = 400
@@ -37,7 +37,7 @@ class PosturePath:
         method: Method of the search: ``continuation`` or ``sampling``; empty without a motion.
         timing: ``time-optimal``, ``scaled`` or ``slowed``; empty without a motion.
         objective: Objective at the end of the path.
-        t: Times, s, shape (n,); a single zero if the start is the end.  Between them, the motion is a
+        t: Times, s, shape (n,); a single zero without a motion.  Between two times, the motion is a
             :class:`~impact_posture.path.row_interpolation.RowInterpolation`.
         q: Postures, shape (n, nq).
         v: Velocities ``ν``, shape (n, nv).
@@ -95,9 +95,9 @@ def check_package() -> None:
 def posture_path(solution: PostureSolution, *, seed: int = 0, effort: int = EFFORT) -> PosturePath:
     """Find a path from ``solution.initial`` to ``solution.q`` along which all constraints hold, and time it.
 
-    If the search does not reach the optimum, it tries other certified optima, best first, and then the best posture
-    that it has reached.  ``effort`` is the largest number of postures that it pulls onto the constraints for each
-    optimum.
+    If the search does not reach the optimum, it tries other certified optima, best first.  If no optimum is reached,
+    the path ends at the best reached posture.  For each optimum, the search pulls at most ``effort`` postures onto
+    the constraints.
 
     Raises:
         InputError: The package of the extra ``path`` is not installed.
@@ -134,7 +134,7 @@ def _still(space: PathSpace, objective: Objective, q: Array, reason: str) -> Pos
 
 
 def _reached(solution: PostureSolution, space: PathSpace, seed: int, effort: int) -> tuple[Connection, str]:
-    """Return the path to the optimum, or the path to the best reached posture and why it ends there."""
+    """Return the path to the optimum, or the path to the best reached posture and the reason."""
     start, objective = solution.initial, solution.problem.objective
     curve = ReachableCurve.of(space, start)
     others = [o.q for o in solution.optima if not np.array_equal(o.q, solution.q)]

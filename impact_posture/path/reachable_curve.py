@@ -1,7 +1,7 @@
-"""Paths of a robot with one degree of freedom left, along the curve of its self-motion in both directions.
+"""Paths of a robot with one degree of freedom left, whose self-motion is a curve.
 
-No sampling is needed.  Either the curve leads to a posture, or it proves that no path exists.  Then the posture is on
-another component of the self-motion, or the constraints cut the curve in both directions.
+The curve either leads to the optimum, or proves that no path exists.  In the second case, the optimum is on another
+component of the self-motion, or the constraints cut the curve in both directions.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from impact_posture.system.arrays import Array
 
 
 class ReachableCurve:
-    """The component of the self-motion through a valid start, shape (nq,)."""
+    """Self-motion curve through a valid start, shape (nq,).  A *side* is the part in one direction."""
 
     def __init__(self, space: PathSpace, start: Array, motion: SelfMotion) -> None:
         self._space, self._start, self._motion, self._manifold = space, start, motion, motion.manifold
@@ -33,7 +33,7 @@ class ReachableCurve:
 
     @staticmethod
     def of(space: PathSpace, start: Array) -> ReachableCurve | None:
-        """Return the component through a start; ``None`` if it is not a curve, or if an end of it proves nothing."""
+        """Return the curve through a start; ``None`` if it is not a curve, or if it ends at a singular posture."""
         problem = space.problem
         jacobian = equality_jacobian(problem, space.projector.numeric.at(start))
         if not isinstance(problem.objective, WorstCaseObjective) or problem.robot.nv - rank(jacobian) != 1:
@@ -50,7 +50,7 @@ class ReachableCurve:
         x = self._manifold.chart.to_x(target)[None]
         proof = "the constraints cut the self-motion in both directions" if all(cut for _, cut in self._sides) else ""
         if self._motion.component_of(x)[0] < 0:
-            # Checked from the target as well, because curves are followed in steps without interval bounds.
+            # Follow the curve of the target, too, because steps without interval bounds can miss the target.
             other = _followed(self._manifold, target)
             home = self._manifold.chart.to_x(self._start)[None]
             apart = other is not None and other.component_of(home)[0] < 0
@@ -73,7 +73,7 @@ class ReachableCurve:
         return min(best, beside(float(minimum.x)), key=value)
 
     def _side(self, nodes: Iterable[Array]) -> tuple[list[Array], bool]:
-        """Return the postures that are reached along nodes, and whether the constraints certainly cut the curve."""
+        """Return the postures reached along a side, and whether it ends at an invalid posture or at its last node."""
         path = [self._start]
         for x in nodes:
             q = self._space.unwound(path[-1], self._manifold.to_q(x))
@@ -85,7 +85,7 @@ class ReachableCurve:
         return path, True
 
     def _along(self, side: list[Array], target: Array) -> list[Array]:
-        """Return the part of a side that ends at a posture; empty if the side does not pass the posture."""
+        """Return the part of a side from the start to ``target``; empty if the side does not pass ``target``."""
         points = self._manifold.embed(np.array([self._manifold.chart.to_x(q) for q in (target, *side)]))
         for k in np.argsort(np.linalg.norm(points[1:] - points[0], axis=1))[:2]:
             end = self._space.unwound(side[k], target)

@@ -18,10 +18,10 @@ Moment = tuple[Array, Array, Array]
 
 @dataclass(frozen=True, eq=False)
 class RowInterpolation:
-    """The motion that has the positions, velocities and accelerations of rows, by a polynomial of degree 5 per row.
+    """Motion through rows of positions, velocities and accelerations, by polynomials of degree 5 between the rows.
 
-    The polynomial belongs to the tangent coordinates at the row before.  For a joint of one axis, these are its angle
-    or travel.
+    The polynomial gives the tangent coordinates at the earlier of the two rows: for a joint of one axis, the change
+    of its angle or travel.
 
     Attributes:
         t: Times of the rows, s, shape (n,).
@@ -37,12 +37,12 @@ class RowInterpolation:
     a: Array
 
     def at(self, t: float) -> Moment:
-        """Return posture, velocity and acceleration at a time; outside the rows, those of the nearest row."""
+        """Return posture, velocity and acceleration at time ``t``, which is limited to the times of the rows."""
         k = int(np.clip(np.searchsorted(self.t, t, side="right") - 1, 0, len(self.t) - 2))
         start, end, h = self.q[k], self.q[k + 1], self.t[k + 1] - self.t[k]
         u = float(np.clip((t - self.t[k]) / h, 0.0, 1.0))
         turn = pin.dDifference(self.model, start, end, pin.ARG1)
-        # The change of this matrix is of second order in the step, and zero for joints of one axis.
+        # Ignore the change of this matrix, which is of second order in the step, and zero for joints of one axis.
         v, a = self.v[k] * h, self.a[k] * h**2
         gap = np.array(pin.difference(self.model, start, end)) - v - a / 2
         speed, bend = h * (turn @ self.v[k + 1]) - v - a, h**2 * (turn @ self.a[k + 1]) - a

@@ -10,18 +10,19 @@ from impact_posture.path.path_space import PathSpace
 from impact_posture.path.time_law import stepped
 from impact_posture.path.timed_curve import SAMPLE_TIME, TimedCurve, sampled
 
-# Share of the limits that speed and acceleration may use together.
+# A motion uses at most this share of the squared speed limits, and of the load that the limits leave beyond the load
+# at rest.
 _SHARE = 0.95
 
 
 def slowed(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedCurve | None:
-    """Return a motion whose speed is within the limits at each place of the curve; ``None`` if none exists.
+    """Return a motion that is only as slow at each ``s`` as the limits require; ``None`` if they allow no motion.
 
-    With ``x = ṡ²``, the load is the load of gravity, plus ``x`` times a load, plus ``s̈`` times another load.  The
-    limits are convex, so ``x`` and ``s̈`` are allowed together if each is at most half of its largest value alone.
-    The largest such ``x(s)`` follows from one pass in each direction with ``dx/ds = 2 s̈`` (Bobrow et al. 1985).
-    Between two knots, the second derivative of the curve is linear, so a few places are enough, most of them at
-    corners.
+    With ``x = ṡ²``, the load is ``g(s) + x c(s) + s̈ d(s)``, where ``g`` is the load of gravity.  The limits are
+    convex.  They therefore allow ``(x, s̈)`` if ``x`` is at most half of its limit at ``s̈ = 0``, and ``s̈`` at most
+    half of its limit at ``x = 0``.  One forward and one backward pass with ``dx/ds = 2 s̈`` give the largest such
+    ``x(s)`` (Bobrow et al. 1985).  Between two knots, the second derivative of the curve is linear, so the limits are
+    checked at only a few values of ``s``, most of them at corners.
     """
     s = curve.places
     zero, speed = np.zeros(space.model.nv), space.problem.robot.velocity_limits

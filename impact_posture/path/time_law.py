@@ -13,11 +13,11 @@ from impact_posture.system.arrays import Array
 if TYPE_CHECKING:
     from scipy.interpolate import PPoly
 
-# Time over which an acceleration changes where the limits alone would let it jump: at most this share of the motion.
+# A jump of the acceleration becomes a ramp of this duration, s, which is at most this share of the motion.
 RAMP, _SHARE = 2e-3, 0.05
-# Digits of a time, s, because the times of a ``JointTrajectory`` are whole nanoseconds.
+# Decimals of a time in seconds, because the times of a ``JointTrajectory`` are whole nanoseconds.
 DIGITS = 9
-# Where the acceleration changes by less than this share of its largest value, no row is needed.
+# A jump of ``s̈`` below this share of the largest jump needs no row of its own.
 _BEND = 0.02
 
 
@@ -28,7 +28,8 @@ class TimeLaw:
     Attributes:
         progress: Polynomials of ``s`` over time, which end one second after the motion.
         duration: Duration, s.
-        ramp: Time ``w`` over which ``s`` is averaged, s: ``(1/w) ∫ s dt`` from ``t − w`` to ``t``.  Zero: no average.
+        ramp: Time ``w`` over which ``s`` is averaged, s: ``(1/w) ∫ s dt`` from ``t − w`` to ``t``.  Zero means no
+            averaging.
     """
 
     progress: PPoly
@@ -66,9 +67,9 @@ def polynomial(coefficients: Array, duration: float) -> TimeLaw:
 def stepped(s: Array, rates: Array) -> TimeLaw:
     """Return the law with the speeds ``ṡ`` at places ``s``, both of shape (n,), from rest to rest.
 
-    Between two places, ``s̈`` is constant.  At a place it would jump, which no interpolation of rows follows without
-    exceeding both values.  So ``s`` is averaged over :data:`RAMP`, and ``s̈`` changes linearly.  An average of speeds
-    and accelerations exceeds no limit, because the limits are convex and hardly change in this time.
+    Between two places, ``s̈`` is constant.  At the places, ``s̈`` would jump, and an interpolation of rows would
+    overshoot.  So ``s`` is averaged over :data:`RAMP`, and ``s̈`` changes linearly.  An average of speeds and
+    accelerations exceeds no limit, because the limits are convex and hardly change in this time.
     """
     from scipy.interpolate import PPoly
 

@@ -17,11 +17,13 @@ from impact_posture.system.arrays import Array
 
 # Largest time between two rows, s, and the least number of rows.
 SAMPLE_TIME, _LEAST_POINTS = 0.01, 21
-# Places between two rows where their interpolation is compared with the motion, as shares of the time between them.
+# Instants between two rows at which the interpolation is compared with the motion, as shares of the interval.
 BETWEEN = (0.2, 0.5, 0.8)
-# Largest difference of a load there, as a share of its limit, and how often the time between two rows may be cut.
+# Largest difference between the loads of interpolation and motion, relative to the load limit, and largest number of
+# times that an interval is divided.
 _DIFFERENCE, _CUTS = 0.004, 10
-# A load without a limit is compared with its largest value, or with this share of the largest load.
+# For a load without a limit, the difference is relative to the largest value of this load, which counts as at least
+# this share of the largest load.
 _SMALL = 0.01
 
 Row = tuple[float, Moment]
@@ -44,13 +46,13 @@ class TimedCurve:
 
     @property
     def instants(self) -> Array:
-        """Times of the rows and of places between them, s, for the check of limits."""
+        """Times of the rows and instants between them (:data:`BETWEEN`), s, for the check of limits."""
         return np.append(np.concatenate([a + (b - a) * np.array([0.0, *BETWEEN]) for a, b in pairwise(self.rows.t)]),
                          self.rows.t[-1])  # fmt: skip
 
 
 def moment(curve: PathCurve, law: TimeLaw, t: float) -> Moment:
-    """Return posture, velocity and acceleration of the motion along a curve at a time."""
+    """Return posture, velocity and acceleration at time ``t`` of the motion along a curve."""
     s, ds, dds = (float(x[0]) for x in law.at(np.array([t])))
     q, along, bent = curve.moment(s)
     return q, along * ds, bent * ds**2 + along * dds
@@ -61,8 +63,8 @@ def sampled(
 ) -> TimedCurve:
     """Return the motion along a curve with a time law.
 
-    The rows are at most :data:`SAMPLE_TIME` apart.  There are more where the acceleration bends, and where the
-    interpolation needs other loads than the motion.
+    The rows are at most :data:`SAMPLE_TIME` apart.  If the interpolation between two rows needs other loads than the
+    motion, the interval is divided, at a jump of ``s̈`` if it contains one.
     """
     step = min(SAMPLE_TIME, law.duration / (_LEAST_POINTS - 1))
     t = np.linspace(0.0, law.duration, int(np.ceil(law.duration / step - 1e-9)) + 1).round(DIGITS)
@@ -71,7 +73,7 @@ def sampled(
     scale = np.where(np.isfinite(effort) & (effort > 0), effort, np.maximum(most, _SMALL * most.max()))
 
     def rows(start: Row, end: Row, cuts: int) -> Iterator[Row]:
-        """Yield the first row and those between it and the next."""
+        """Yield the row ``start`` and the rows between ``start`` and ``end``."""
         (a, _), (b, _) = start, end
         pair, times = _joined(space, [start, end]), a + (b - a) * np.array(BETWEEN)
         differences = [limits.load(*pair.at(time)) - limits.load(*moment(curve, law, time)) for time in times]
