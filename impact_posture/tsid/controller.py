@@ -29,7 +29,7 @@ from impact_posture.tsid.tasks.task import Task
 _LONGEST = 10
 # Least nv for which LAPACK factorizes the cost (:class:`WhitenedSolver`).  For smaller robots, this saves no time.
 _LARGE = 20
-# A measurement is invalid if the sum of its squares is larger (numbers of about 1e8 m, rad/s or N).
+# A measurement is invalid if the sum of its squares exceeds this value (numbers of about 1e8 m, rad/s or N).
 _ABSURD = 1e16
 # Largest violation of a control limit, relative to the largest limit.
 _EXCESS = 1e-6
@@ -82,8 +82,7 @@ class Report:
 
     Attributes:
         status: Result of the tick.
-        relaxed: Strict levels and limits that cannot hold because of more important constraints, the most important
-            first.
+        relaxed: Strict levels and limits that more important constraints prevent, the most important first.
         deficient: Strict levels that do not hold because their rows are dependent.  More important levels determine
             the same motion, rows contradict each other, or the posture is nearly singular (:class:`LevelRank`).
         residuals: Task name → ``ÿ − ÿ*``; the name ``contacts`` stands for all contacts.
@@ -196,7 +195,7 @@ class Controller:
         q, v = np.asarray(q, dtype=float), np.asarray(v, dtype=float)
         if q.shape != state.q.shape or v.shape != state.v.shape:
             raise ValueError(f"q and v have shapes {q.shape} and {v.shape}, not {state.q.shape} and {state.v.shape}")
-        # If the sum of squares is finite and below the bound, every number is finite and bounded too.
+        # If the sum of squares is finite and below ``_ABSURD``, every number is finite and not too large.
         total = q.dot(q) + v.dot(v)
         if force is not None:
             force = np.asarray(force, dtype=float)

@@ -1,4 +1,4 @@
-"""Solution of the QP of a tick.  If not all strict levels can hold, the least important level is relaxed first."""
+"""Solution of the QP of a tick.  If the strict levels are infeasible, the least important level is relaxed first."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from impact_posture.tsid.qp.quadratic_program import EQUALITY, QP, Solved
 
 # A row counts as satisfied if its error is below this share of the sum of its absolute terms.
 _OFF = 1e-6
-# A row that violates a bound by more keeps its value.  Relative to the norm of the row times the norm of z.
+# A row that violates a bound by more than this keeps its value; relative to the norm of the row times the norm of z.
 _MISSES = 1e-9
 # Largest violation of a bound by a result, relative as for ``_MISSES``.
 _ROUNDING = 1e-13
-# Bound that DAQP treats as infinite, and the settings of DAQP for the scaled program of the cost.
+# Bound that DAQP treats as infinite, and the settings of DAQP for the scaled program in :func:`_cheapest`.
 _FAR, _SETTINGS = 1e30, SETTINGS | {"primal_tol": 1e-11}
-# Smaller curvatures of the cost, relative to the largest, are raised to this value.
+# Curvatures of the cost below this share of the largest curvature are raised to this share.
 _FLATTEST = 1e-14
-# Weight of the proximal-point iterations with which DAQP decides whether strict levels can hold.
+# Weight of the proximal-point term with which DAQP checks whether the strict priority levels are feasible.
 _FLAT = 1e-6
 
 
@@ -45,7 +45,7 @@ class Outcome:
     """Result of a tick's QP.
 
     Attributes:
-        solved: Solution; ``None`` if not even the relaxed QPs have a solution.
+        solved: Solution; ``None`` if the relaxed QPs have no solution either.
         relaxed: Strict levels and limits that do not hold, the most important first.
     """
 
@@ -57,10 +57,9 @@ def solve(assembly: Assembly, solver: DaqpSolver) -> Outcome:
     """Solve the QP of the assembly, starting from the solver's active set.  If this fails, solve a relaxed QP.
 
     Dynamics, control limits and friction always hold, because every state has an acceleration that satisfies them.
-    The acceleration bounds of joint limits are exceeded only as far as these rows require.  Then come the levels,
-    the most important first.  A level holds if it can hold together with the levels above it.  Otherwise, its error
-    is minimized by least squares, and the levels below may not change this error.  Last, the cost determines the
-    accelerations that are still free.
+    The acceleration bounds of joint limits are exceeded only as far as these hard rows require.  Then follow the
+    strict levels, the most important first.  The error of a level is minimized by least squares, and the levels below
+    must not change this error.  Last, the cost determines the accelerations that are still free.
     """
     qp = assembly.rank.qp
     if assembly.rank.changed:
@@ -84,7 +83,7 @@ def solve(assembly: Assembly, solver: DaqpSolver) -> Outcome:
 
 
 def _cheapest(qp: QP, units: Array, nearest: Array) -> Solved:
-    """Minimize the cost without a change of the errors of the lexicographic answer ``nearest``.
+    """Minimize the cost without changing the errors of the lexicographic answer ``nearest``.
 
     Equations, and rows that violate their bounds, keep their values.  The cost is therefore minimized in the null
     space of these rows: ``z = nearest + W y``.  In the basis ``W``, the cost is a sum of squares.  All other bounds
@@ -126,7 +125,7 @@ def _cheapest(qp: QP, units: Array, nearest: Array) -> Solved:
 
 
 def missed(assembly: Assembly, z: Array, *, equations: bool) -> tuple[Relaxed, ...]:
-    """Return the strict levels with errors at ``z``: in their equations, or else in their dependent rows."""
+    """Return the strict levels with errors at ``z`` in their equations; if not ``equations``, in their other rows."""
     levels = []
     for name, level in assembly.levels:
         rows = assembly.rank.rows(level, equations)

@@ -32,7 +32,7 @@ class SupportContact:
         normal: Unit normal out of the ground, world.
         friction: Coulomb coefficient.
         least: Lower bound on the normal force, N.
-        kp: Stiffness that returns the contact to its place at ``reset``, 1/s².
+        kp: Stiffness that pulls the contact back to its pose at the last ``reset``, 1/s².
         kd: Damping of the contact, 1/s.
         weight: Weight of the contact's acceleration in the cost; with ``None``, the contact is a hard constraint.
             The rows of several points can be dependent, and their rank can change with the posture (the four feet of

@@ -36,7 +36,7 @@ class TaskFormulation:
         contacts: Contacts with the ground.
         force_point: Point where a measured contact force acts; with ``None``, the dynamics ignore measured forces.
         law: Law that stops joints at their limits; with ``None``, the accelerations are unlimited.
-        row_limits: Limits for expected impacts; like joint limits, these limits are relaxed if they cannot hold.
+        row_limits: Limits for expected impacts; like joint limits, these limits are relaxed if they are infeasible.
         force_weight: Weight of contact forces in the cost, 1/N².  The weight of moments is a hundred times as large,
             1/(N·m)².
         spare_weight: Weight of the thrusts in the null space of redundant rotors, 1/N².

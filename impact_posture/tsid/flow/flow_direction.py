@@ -18,9 +18,10 @@ from impact_posture.tsid.qp.daqp_solver import DaqpSolver
 from impact_posture.tsid.qp.quadratic_program import QP
 from impact_posture.tsid.state import State
 
-# Least value of ``H/H₀`` under the square root.
+# Least value of ``H/H₀`` in ``√(H/H₀)``.
 _LEAST = 1e-8
-# If the sine of the tilt is smaller, the slope of the tilt is set to zero, because the tilt axis is undefined.
+# If the sine of the tilt is smaller than this, the slope of the tilt is set to zero, because the tilt axis is
+# undefined.
 _LEVEL = 1e-6
 # Largest violation of a limit during braking, rad (m) for joints, and a share of the range for static controls.
 _NEAR = 1e-3
@@ -31,7 +32,7 @@ _AIM = 2e-3
 # Distance that the flow keeps from the limits of the static controls, as a share of the range.  Their slope is only
 # estimated, so this distance is larger than ``_AIM``.
 _RESERVE = 8e-3
-# If the squared length of a row in the free directions is smaller, no motion along these directions corrects the row.
+# If the squared length of a row in the free directions is smaller than this, the row is ignored.
 _FLAT = 1e-6
 _PositiveShare = Annotated[float, Demand(lambda value: 0 < value <= 1, "a number above zero, up to 1")]
 
@@ -43,17 +44,18 @@ class FlowOptions:
 
     Attributes:
         speed: Largest speed ``v`` of an entry of ``q_r``, rad/s (m/s).
-        acceleration: Largest acceleration ``a``, rad/s² (m/s²).  Two fifths of ``a`` suffice to stop the flow within
-            its step.
-        rho: ρ, weight of the squared distance from the start in ``Φ`` (:class:`FlowDirection`), 1/rad².
-        mu: μ, lower bound on the curvature that the flow uses, per rad², relative to ``H₀``.
-        epsilon: ε, relative to ``H₀``.  The flow rests if the predicted decrease is below ε and resumes above 4 ε.
+        acceleration: Largest acceleration ``a``, rad/s² (m/s²).  The speed is limited so that ``2a/5`` suffices to
+            stop the flow at the end of its step.
+        rho: ρ in ``Φ`` (:class:`FlowDirection`), the weight of the squared distance from the start, 1/rad².
+        mu: μ, per rad², relative to ``H₀``.  Absolute curvatures below μ are raised to μ.
+        epsilon: ε, relative to ``H₀``.  The flow rests if the predicted decrease of ``H`` is below ε, and resumes if
+            it is above 4 ε.
         duration: Longest time that the flow moves after each start, s.  Time on a path or at rest is not included.
         joint_margin: Distance from the joint limits, rad (m); at most an eighth of the range of a joint.
         com_margin: Distance of the center of mass from the edges of the support polygon, m.
         tilt: Largest angle between the vertical and :attr:`~impact_posture.robot.robot.Robot.upright`, rad.
         share: Share of the actuators' limits that the static controls at ``q_r`` may use.
-        haste: Share that accelerations may use of the control range that the static controls leave.  Braking before a
+        haste: Accelerations may use this share of the control range that the static controls leave.  Braking before a
             limit may use the share ``(1 + haste)/2``.
         tracking: If the joints of the robot lag behind ``q_r`` by this error, rad (m), the flow stops and waits.
     """
@@ -77,7 +79,7 @@ class FlowDirection:
 
     ``Φ`` contains the square root of ``H``, because the velocity jump is proportional to ``√H``.  ``y`` minimizes
     ``½ yᵀ|B_Z| y + (Zᵀ∇Φ)ᵀ y``.  ``B_Z`` is the curvature of ``H/H₀`` times ``√(H₀/H)`` plus the curvature of the
-    pull towards the start.  ``|B_Z|`` has the same eigenvectors as ``B_Z`` and the eigenvalues ``max(|λᵢ|, μ)``
+    second term of ``Φ``.  ``|B_Z|`` has the same eigenvectors as ``B_Z`` and the eigenvalues ``max(|λᵢ|, μ)``
     (saddle-free Newton, Dauphin et al. 2014), so that the step leaves saddle points.
 
     The curvature ``B`` is estimated from gradient differences by the Powell symmetric Broyden update.  The slope
@@ -106,7 +108,7 @@ class FlowDirection:
         self._up = robot.upright
         # Index of the row of the tilt, the tilt angle, and the vertical in base axes.
         self._tilting, self._angle, self._vertical = self._joints.size + edges.shape[0], 0.0, np.zeros(3)
-        # The pull towards the start acts on joints only.
+        # The distance from the start counts joints only.
         self._pull = np.full(nv, options.rho)
         self._pull[: 6 if robot.floating else 0] = 0.0
         self.B, self.gain, self.failures = np.zeros((nv, nv)), 0.0, 0
@@ -179,7 +181,7 @@ class FlowDirection:
         values, vectors = np.linalg.eigh(curvature)
         axes = Z @ (vectors / np.sqrt(np.maximum(np.abs(values), self._mu)))
         step = self._solve(axes, axes.T @ (Z @ slope))
-        # The step also decreases the energies of pull and springs, but only the decrease of H is the gain.
+        # The step also decreases the distance term and the energy of the springs, but ``gain`` counts only ``H``.
         self.gain = min(self.gain * root, -float(gradient @ step))
         return step
 

@@ -19,7 +19,7 @@ _ABLE = 0.1
 _CAUTION = 1.5
 # Largest ratio of the speed of the flow to its step, 1/s.
 _RATE = 4.8
-# Smallest divisor for speeds divided by a step, rad (m); prevents a division by zero.
+# Smallest divisor when a speed is divided by a step, rad (m); prevents a division by zero.
 _TINY = 1e-12
 # Time constant of the return to contacts and tasks, s.
 _RETURN = 0.1
@@ -65,13 +65,13 @@ class FlowGovernor:
         The function tries three candidates:
 
         1. Each joint uses its full acceleration, and the change is projected on the constraints.  Unless the change
-           slows the flow down, the part is left out that moves the zero moment point too far.
+           slows the flow down, the part that moves the zero moment point too far is removed.
         2. The velocity changes straight towards the wanted velocity.
         3. The velocity decreases without a change of direction.
 
         Candidates 1 and 2 have three attempts; the last two attempts leave out the part that crosses limits.  The
-        result is the first attempt after which the flow can stop within the limits.  The assumed deceleration is the
-        one that the actuators permitted in the last changes.
+        result is the first attempt after which the flow can stop within the limits.  The flow assumes the
+        deceleration that the actuators permitted in the last changes.
 
         ``step`` is ``δ``, shape (nv,).  ``fastest`` is the largest speed of an entry, rad/s (m/s).  The change takes
         ``period`` seconds.  If ``slope`` is ``∇H/H₀``, shape (nv,), the change must not increase ``H``; ``None``

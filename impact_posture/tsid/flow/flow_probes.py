@@ -11,7 +11,8 @@ from impact_posture.tsid.flow.redundancy import Redundancy
 
 # Least squared length of a direction, which prevents a division by zero.
 _EMPTY = 1e-24
-# If a direction is shorter after its orthogonalization, rounding errors are large, so it is orthogonalized twice.
+# If a direction is shorter than this after its orthogonalization, rounding errors are large, so it is orthogonalized
+# twice.
 _NEW = 0.1
 
 

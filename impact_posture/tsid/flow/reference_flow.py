@@ -28,14 +28,14 @@ from impact_posture.tsid.tasks.task import Task
 
 # Step of the finite differences along the redundancy, rad.
 _STEP = 1e-4
-# Least displacement between two evaluations that is used to update the curvature estimates, rad (m).
+# Curvature estimates are updated only if two evaluations are at least this far apart, rad (m).
 _MOVED = 1e-6
-# If the step towards a posture of the path is shorter, rad (m), the flow continues to the next posture.  The flow has
-# then reached the posture, or the limits permit no closer posture.
+# If the step towards a posture of the path is shorter than this, rad (m), the flow continues to the next posture.
+# The flow has then reached the posture, or the limits permit no closer posture.
 _REACHED = 0.02
 # Speed below which a flow that is off is set to rest, rad/s (m/s).
 _STILL = 1e-5
-# At a lower speed, rad/s (m/s), the point where the flow would stop is too near for finite differences.
+# Below this speed, rad/s (m/s), the point where the flow would stop is too near for finite differences.
 _SLOW = 1e-3
 # Number of ticks of one update.
 UPDATE_TICKS = 14
@@ -262,7 +262,7 @@ class ReferenceFlow:
             self._wanted[:] = 0.0
 
     def _govern(self, measured: Array) -> None:
-        """Set the acceleration of the flow, which includes the return to contacts and tasks, within all limits."""
+        """Set the acceleration within all limits, including the acceleration of the return to contacts and tasks."""
         options = self.options
         period, self._elapsed = self._elapsed, 0.0
         if not period > 0:

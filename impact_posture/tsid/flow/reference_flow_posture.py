@@ -52,7 +52,7 @@ class ReferenceFlowPosture(JointPosture):
             gradient: Function ``q → (H, ∇H)``, or a compiled export, whose objective gives H and ∇H.
             options: Parameters of the flow.
             path: Posture, shape (nq,), or postures, shape (k, nq), that ``q_r`` visits first, for example an offline
-                optimum or the path to it.  From the last posture, the flow takes over.
+                optimum or the path to it.  After the last posture, the flow starts.
             name: Name in reports.
             gains: Arguments of :class:`~impact_posture.tsid.tasks.joint_posture.JointPosture`.
 

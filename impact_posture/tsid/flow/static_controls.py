@@ -81,7 +81,7 @@ class StaticControls:
         """Return the share of the acceleration ``more``, 0 to 1, that the actuators permit.
 
         The acceleration ``known``, shape (nv,), cannot be changed.  The static controls ``shares``, shape (m,), leave
-        a part of the control ranges.  Of this part, both accelerations together may use the share ``most``.  The
+        a part of the control ranges.  The sum of both accelerations may use the share ``most`` of this part.  The
         contact forces follow from the last call of :meth:`shares`.
         """
         self._pair[:, 0], self._pair[:, 1] = known, more
@@ -107,7 +107,7 @@ def support_edges(state: State, contacts: Sequence[SupportContact]) -> tuple[Arr
     of the center of mass.
 
     Raises:
-        InputError: There are contacts, but the base is fixed and carries weight, too.
+        InputError: The robot has contacts, but its base is fixed.
     """
     if contacts and not state.robot.floating:
         what = "its base is fixed, and a flow with contacts needs a floating base"

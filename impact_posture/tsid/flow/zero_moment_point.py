@@ -13,9 +13,9 @@ from impact_posture.tsid.support_contact import SupportContact
 
 # Share of the distance from the center of mass to an edge that accelerations may use.
 _SHARE = 0.8
-# The bounds count a distance from the center of mass to an edge as at least this value, m.
+# A shorter distance from the center of mass to an edge is replaced by this distance, m.
 _LEAST = 0.01
-# If the squared length of a row in the free directions is smaller, no motion along these directions corrects the row.
+# If the squared length of a row in the free directions is smaller than this, the row is ignored.
 _TINY = 1e-12
 
 

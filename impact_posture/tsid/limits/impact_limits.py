@@ -14,7 +14,7 @@ from impact_posture.tsid.point_kinematics import Point
 from impact_posture.tsid.state import State
 from impact_posture.tsid.support_contact import SupportContact
 
-# Singular values of a contact Jacobian below this share of the largest are treated as zero.
+# Singular values of a contact Jacobian below this share of the largest singular value are treated as zero.
 _RANK = 1e-6
 
 

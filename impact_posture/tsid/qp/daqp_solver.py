@@ -11,7 +11,7 @@ from impact_posture.tsid.qp.quadratic_program import QP, Solved
 # solution, because the answer violates bounds after a cycle.  Flag -6 (dependent equations) does not mean infeasible,
 # because DAQP also returns -6 if bounds of the last active set depend on each other.
 SOLVED, _NONE = (1, 2), -1
-# Flag for a program that failed for another reason.
+# Exit flag of this class for a failure of the solver, which says nothing about feasibility.
 _FAILED = 0
 # primal_tol is the largest violation of a bound.  iter_limit is the largest number of iterations.  sing_tol is the
 # squared sine of the smallest angle between a row and the active rows.  For a quadruped, the cost has the condition

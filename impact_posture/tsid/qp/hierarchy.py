@@ -13,8 +13,8 @@ from impact_posture.tsid.qp.quadratic_program import EQUALITY, INEQUALITY
 
 # Bounds are scaled so that none exceeds this value, because the tolerances of DAQP are absolute.
 _LARGEST = 1e4
-# Within this tolerance, a row counts as being at its bound, relative to the norm of the row times the norm of z.  The
-# refinement uses the first of these values that does not make the answer worse.
+# Tolerances within which a row is at its bound, relative to the norm of the row times the norm of z.  The refinement
+# uses the first tolerance that does not make the answer worse.
 _AT = (1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4)
 # Singular values of rows below this value, relative to the spectral norm, are treated as zero.
 _RANK = 1e-9
@@ -52,7 +52,8 @@ def lexicographic(levels: Sequence[Level], units: Array | float = 1.0) -> Array 
     if missed:
         whole = _stacked(scaled[: missed + 1])
         if _holds(whole, _onto(whole, y)):
-            # DAQP violated a level that can hold.  Join all levels down to this level, and solve again.
+            # DAQP violated a level that is feasible together with the levels above.  Join these levels, and solve
+            # again.
             return lexicographic([_stacked(levels[: missed + 1]), *levels[missed + 1 :]], units)
     return np.asarray(units * y)
 
@@ -118,7 +119,7 @@ def _no_worse(levels: Sequence[Level], new: Array, old: Array) -> bool:
 
 
 def _onto(level: Level, y: Array) -> Array:
-    """Return the point nearest to ``y`` at which the level holds; return ``y`` if the solver fails."""
+    """Return the point nearest to ``y`` that satisfies the level; return ``y`` if the solver fails."""
     lengths, size = _lengths(level), _size(y)
     A = np.ascontiguousarray(level.A / lengths[:, None])
     high, low = (np.clip((bound / lengths - A @ y) / size, -1e30, 1e30) for bound in (level.upper, level.lower))

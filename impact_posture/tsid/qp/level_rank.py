@@ -12,12 +12,12 @@ from impact_posture.tsid.qp.quadratic_program import EQUALITY, INEQUALITY, QP
 from impact_posture.tsid.smooth_step import smooth
 
 # A direction is damped if its singular value, divided by the length of the level's longest row, is smaller than this.
-# In their home postures, all robots of the package are above 0.03.
+# In the home postures of all shipped robots, this ratio is above 0.03.
 SINGULAR = 2e-2
 # Directions are removed if their singular value is below this share of SINGULAR.  The share is far above rounding
 # errors, but too small for a visible effect.
 _NOTHING = 1e-9
-# Least 1 − α, which bounds the weight of a damped row for the solver.
+# Least ``1 − α``, which limits the weight ``α/(1 − α)`` of a damped row.
 _LEAST = 1e-8
 
 
@@ -33,14 +33,14 @@ class LevelRank:
     - ``x = 0``: the levels above determine the row, or the row contradicts other rows of its level.  The row is
       removed from the QP.  The other rows give the least-squares answer of the level.
     - Otherwise, the row is damped: it becomes a term ``α/(1 − α) (q·ν̇ − c/s)² + x (q·ν̇)²`` of the cost, with
-      ``α = x²(3 − 2x)``.  ``q`` is the row's direction of motion, and ``c`` is its right-hand side.  The term has the
-      mean weight of the cost.  With decreasing ``x``, the row changes smoothly from an equation to nothing, so
-      accelerations are continuous through a singular posture.  The accelerations are at most ``3/s₀`` times ``c``.
-      The levels below can use the direction with the factor ``√(1 − α)``.
+      ``α = x²(3 − 2x)``.  ``q`` is the row's direction of motion, and ``c`` is its right-hand side.  The term is
+      multiplied by the mean weight of the accelerations in the cost.  With decreasing ``x``, the row changes smoothly
+      from an equation to nothing, so accelerations are continuous through a singular posture.  The accelerations are
+      at most ``3/s₀`` times ``c``.  The levels below can use the direction with the factor ``√(1 − α)``.
 
-    The result depends only on the present rows and on their lengths at reset.  While all rows are independent, the QP
-    does not change.  A singular value changes at most by the norm of the change of the matrix (Weyl 1912), so most
-    ticks detect independent rows without a decomposition.
+    The result depends only on the present rows and on their lengths at reset.  While all rows are independent, all of
+    them remain equations.  A singular value changes at most by the norm of the change of the matrix (Weyl 1912), so
+    most ticks detect independent rows without a decomposition.
 
     Attributes:
         qp: The QP to solve.

@@ -46,7 +46,7 @@ class FrameTask(TargetTask[Target]):
     """Base class of tasks that regulate a point of a frame.
 
     Attributes:
-        target: Desired position or pose of the point in the world; by default, the one at ``reset``.
+        target: Desired position or pose of the point in the world; by default, its present value at ``reset``.
         point: The regulated point.
     """
 

@@ -75,7 +75,7 @@ class ImpactRobustPosture(JointPosture):
       ``λ``, ``K`` is a stiffness in 1/s² like ``K_p`` on every robot, although ``H`` scales with 1/armature².  Near
       an optimum with the curvature ``λ*``, the term is a spring with the stiffness ``K λ*/λ``.  This stiffness can be
       several times ``K``, because ``λ`` is the curvature at the start, where ``H`` may even be concave.
-    - By default, ``K_d = 2√(K_p + K)``, which is critical damping for both springs together if ``λ* = λ``.
+    - By default, ``K_d = 2√(K_p + K)``, which is critical damping for the sum of both stiffnesses if ``λ* = λ``.
     - The length of the term is at most ``K·reach``, the force of a spring ``K`` that is stretched by ``reach``.  If
       this bound were below ``K_p|q_des ⊖ q|``, the robot would stop before the optimum.
     - ``s(q)`` fades out the part of the term that pushes a joint into a position limit.  The fade begins
