@@ -39,7 +39,7 @@ class CommandGroup(TyperGroup):
 app = typer.Typer(
     name="impact-posture",
     cls=CommandGroup,
-    help="Find the posture of a redundant robot with the lowest impact, see why, and export it to the controller.",
+    help="Find the posture in which an impact disturbs a redundant robot least, see why, and export it as C code.",
     epilog="Each command has its own --help. ROBOT: a name from 'impact-posture robots', or a path to a .urdf.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,

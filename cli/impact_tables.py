@@ -68,7 +68,7 @@ def worst_tables(page: Page, frames: Sequence[str], blocks: Mapping[str, Mapping
 
 
 def worst_lines(page: Page, frames: Sequence[str], blocks: Mapping[str, Mapping[str, Any]]) -> None:
-    """Print the worst normal, the worst impulses and whether the feet stay, for each evaluation in ``blocks``."""
+    """Print worst normal, worst impulses, and whether the feet stay in place, for each evaluation in ``blocks``."""
     named = {f" {name}" if len(blocks) > 1 else "": block for name, block in blocks.items()}
     for when, block in named.items():
         if "cone" in block:

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from impact_posture.posture.formulation.problem_file import Prepared
     from impact_posture.posture.search.multistart import PostureSolution
 
-# Number of actuators in the table of loads: the ones nearest to their limits.
+# Number of actuators in the table of loads: the actuators nearest to their limits.
 _TIGHTEST = 3
 
 

@@ -35,8 +35,8 @@ class Page:
     """Writes titles, lines and tables to standard output, and warnings and progress to standard error.
 
     Attributes:
-        json: Standard output is one JSON document, so there is no progress line either.
-        quiet: There are no warnings, no progress line and no advice.
+        json: Whether standard output is one JSON document.  Then there is no progress line.
+        quiet: Whether to leave out warnings, the progress line and advice.
     """
 
     def __init__(self, *, json: bool = False, quiet: bool = False) -> None:

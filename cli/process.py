@@ -56,7 +56,7 @@ def memory_fault() -> str:
 def _open_streams() -> None:
     """Open the null device for each closed standard stream.
 
-    Otherwise, the next opened file would get the descriptor of this stream, and output would be written into it.
+    Otherwise, the next opened file would get the descriptor of this stream, and output would be written to this file.
     """
     for number in (0, 1, 2):
         try:

@@ -51,7 +51,7 @@ class TypedSettings:
         """Return whether the argument ROBOT|RESULT_DIR is a result folder.
 
         Raises:
-            UsageError: The argument is a result folder, and an option other than the ``free`` ones is given.
+            UsageError: The argument is a result folder, and an option that is not in ``free`` is given.
         """
         if not os.path.isfile(Path(robot) / "result.json"):
             return False

@@ -12,7 +12,7 @@ COMMANDS: Final[dict[str, str]] = {
     "robots": "List the robots known by name, and other ways to specify a robot.",
     "inspect": "Show a robot: joints, frames, mass, limits, armature, postures, actuation.",
     "evaluate": "Measure an impact at a posture: H, G, V, S, E, ellipsoid, gradient, predicted jump.",
-    "optimize": "Find the posture with the lowest impact; write the posture, pictures and C code.",
+    "optimize": "Find the posture with the smallest objective; write the posture, pictures and C code.",
     "plot": "Draw a result again: ellipsoids, postures, jumps, the null-space path.",
     "report": "Write report.html of an output folder again: an offline page with the robot in 3-D.",
     "view": "Open report.html of an output folder in the browser.",

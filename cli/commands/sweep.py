@@ -30,7 +30,7 @@ Mpi = Annotated[bool, options.option("--mpi", RUN, "Solve on the MPI ranks of mp
 Slurm = Annotated[
     list[str] | None,
     options.option(
-        "--slurm", RUN, "Use Slurm job arrays, with an option of submitit; repeatable.", metavar="KEY=VALUE"
+        "--slurm", RUN, "Run in Slurm job arrays; KEY=VALUE is a submitit option; repeatable.", metavar="KEY=VALUE"
     ),
 ]
 Out = Annotated[

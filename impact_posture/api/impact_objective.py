@@ -62,10 +62,13 @@ class ImpactObjective(WorstCaseObjective):
         bilateral: Whether several contacts can pull as well as push.
         model_variants: Robot models, the nominal model first.  The objective is the worst value over the models.
         weights: Weights of the weighted metric: nv numbers, a TOML file, or ``velocity-limits``.
-        armature_range: Lowest and highest factor on the armature, for ``model_variants``.
-        payloads: Payloads that the robot may carry, one at a time, for ``model_variants``: frame and mass in kg.
-        contact_point: ``front`` moves each contact point to the foremost point along −n of the links at the contact.
-        posture: Posture of this front: a name, a file or a configuration; ``None`` selects the default posture.
+        armature_range: Lowest and highest factor on the armature.  If ``model_variants`` is empty, variants are built
+            from this range and from ``payloads``.
+        payloads: Payloads that the robot may carry, one at a time: frame and mass in kg.
+        contact_point: ``front`` moves each contact point to the foremost point, along −n, of the links that move with
+            the contact frame.
+        posture: Posture at which ``front`` determines the contact point: a name, a file or a configuration; ``None``
+            selects the default posture.
         joint_model: Model of the inertia at the joints: ``reflected``, ``link`` or ``locked``
             (:func:`~impact_posture.robot.joint_model.with_joint_model`); ``None`` selects the model of the robot.
 

@@ -36,8 +36,8 @@ class PostureProblem:
             :class:`~impact_posture.impact.objective.Objective`.
         posture: Start of the search: the name of a posture, a file, or a configuration of shape (nq,); ``None``
             selects the default posture.
-        speed: Approach speed of the predicted jumps, m/s.
-        restitution: Coefficient of restitution of the predicted jumps.
+        speed: Approach speed of the predicted impact, m/s.
+        restitution: Coefficient of restitution of the predicted impact.
         task: Fields of :class:`~impact_posture.config.problem_settings.ProblemSettings` that describe the task, such
             as ``base="level"``, ``target_position=(x, y, z)``, ``keep_contacts=True`` or ``hold=("joint",)``.
 

@@ -47,7 +47,8 @@ class PostureResult:
         problem: The solved problem.
         solution: Result of the search.
         robustness: Comparison with the optima of the model variants; ``None`` if there are no model variants.
-        tradeoff: Best objectives under different bounds; ``None`` before a call of :meth:`trade_off`.
+        tradeoff: Best objective under each of several bounds on the distance or the peak force; ``None`` before a
+            call of :meth:`trade_off`.
         motion: Timed path from the start to the optimum; ``None`` before a call of :meth:`path`.
         global_search: Result of the search ``global``; ``None`` if another search was used.
     """
@@ -117,7 +118,7 @@ class PostureResult:
         compile: CompileMode = "auto",
         progress: Progress | None = None,
     ) -> PostureResult:
-        """Return this result with the best objectives under ``points`` different bounds on ``against``.
+        """Return this result, completed by the best objective under each of ``points`` bounds on ``against``.
 
         Args:
             points: Number of bounds.
@@ -141,7 +142,7 @@ class PostureResult:
 
     @checked
     def path(self, *, seed: ZeroOrMore = 0) -> PostureResult:
-        """Return this result with a path from the start to the optimum, timed within the robot's limits.
+        """Return this result, completed by a path from the start to the optimum that respects the robot's limits.
 
         See :func:`~impact_posture.path.posture_path.posture_path`.  If no path leads to the
         best optimum, paths to the other optima are tried, and :attr:`answer` is the posture where the path ends.  A
@@ -178,9 +179,11 @@ class PostureResult:
             codegen: Whether to export, build and check the C code as well.
             formats: File formats of the pictures: ``png``, ``svg``, ``pdf``.
             report: Whether to write ``report.html``, a page with the result and the robot in 3-D.
-            meshes: Whether to copy the meshes of the user's own URDF into ``report.html``, for everyone who opens it.
+            meshes: Whether to embed the meshes of the user's own URDF in ``report.html``.  Everyone who opens the
+                page gets them.
             jobs: Number of parallel processes that draw and compile.
-            progress: Function that is called with the numbers of finished and of all files after each file.
+            progress: Function that is called after each file, with the number of finished files and the number of all
+                files.
 
         Returns:
             The folder, the C export in the folder, and the reason if the C code could not be built.
@@ -247,7 +250,8 @@ def optimize(
         compile: When to compile the program: ``auto`` (if it saves time), ``always`` or ``never``.
         search: ``adaptive`` (:mod:`~impact_posture.posture.search.screening`), ``multistart``, or ``global``, which
             continues after ``adaptive`` (:func:`~impact_posture.posture.search.global_search.search_globally`).
-        progress: Function that is called after each start with the numbers of finished and of all starts.
+        progress: Function that is called after each start, with the number of finished starts and the number of all
+            starts.
         finish_all: Also finish starts that can no longer become the best.  The search ``global`` always finishes all
             starts.
 

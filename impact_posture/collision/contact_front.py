@@ -22,15 +22,16 @@ from impact_posture.system.arrays import Array
 
 # Points less than this (m) behind the foremost point belong to the same flat front.
 _FLAT = 5e-4
-# Corners of the polygon around a flat front.
+# Number of corners of the polygon around a flat front.
 _SIDES = 64
 
 
 @dataclass(frozen=True)
 class ContactFront:
-    """The foremost point of the links that move with a contact frame, in a direction.
+    """The foremost point, along a given direction, of the links that move with a contact frame.
 
-    On a flat front, it is the point nearest to the line through the origin of the frame in this direction.
+    If several points are foremost (a flat front), the point nearest to a line is used.  This line goes through the
+    origin of the frame, along the given direction.
 
     Attributes:
         link: Link with the foremost point.
@@ -45,13 +46,14 @@ class ContactFront:
 
 @dataclass(frozen=True, eq=False)
 class Silhouette:
-    """A convex hull around a shape: corners, each with a ball and a disk around it.
+    """Convex hull that contains a shape, given by corners, and by a ball and a disk around each corner.
 
     Attributes:
         link: Link of the shape.
         corners: Corners in the axes of the joint that carries the link, shape (k, 3), m.
         ball: Radius of the balls, m.
-        disk: Axis of the disks in the axes of the joint, its length is their radius, shape (3,), m.
+        disk: Vector along the axis of the disks, in the axes of the joint, shape (3,), m.  Its length is the radius
+            of the disks.
     """
 
     link: str
@@ -61,7 +63,7 @@ class Silhouette:
     disk: StoredArray
 
     def foremost(self, direction: Array) -> Array:
-        """Return points among which are the foremost ones along a unit direction, axes of the joint, shape (k, 3)."""
+        """Return points that include the foremost points along a unit direction; axes of the joint, shape (k, 3)."""
         points = self.corners + self.ball * direction
         radius = float(np.linalg.norm(self.disk))
         if radius == 0:
@@ -84,14 +86,14 @@ class _Silhouettes:
 def contact_front(
     robot: Robot, q: Array, frame: str, offset: Vector3, direction: Array, held: Sequence[str] = ()
 ) -> ContactFront | None:
-    """Return the front of the links that do not move relative to a contact frame; ``None`` if they have no shapes.
+    """Return the front of the links that do not move relative to a contact frame; ``None`` without shapes.
 
     These are the link of the frame, the links welded to it, and the links behind joints that do not move.  Their
     shapes are the collision shapes, or the visual shapes of links without collision shapes.
 
     Args:
         robot: The robot with its shapes.
-        q: Posture, shape (nq,); it matters only for the joints that do not move.
+        q: Posture, shape (nq,); only the positions of the joints ``held`` have an effect.
         frame: Contact frame.
         offset: Contact point in the coordinates of the frame, shape (3,), m.
         direction: Direction towards the surface, ``−n``, in the coordinates of the frame, shape (3,).
@@ -166,11 +168,12 @@ def _ends(half_length: float) -> Array:
 
 
 def _nearest(flat: Array, axis: Array) -> Array:
-    """Return the point of the convex hull of points in a plane through zero that is nearest to zero, shape (3,)."""
+    """Return the point nearest to zero in the convex hull of points, shape (3,); zero lies in their plane."""
     across = np.linalg.svd(axis[None])[2][1:]
     points = flat @ across.T
     angles = np.arange(_SIDES) * 2 * np.pi / _SIDES
-    # The farthest points along turning directions are the corners of the hull in their order around it.
+    # The farthest points along directions of increasing angle are the corners of the hull, in counter-clockwise
+    # order.
     order = (points @ np.stack([np.cos(angles), np.sin(angles)])).argmax(axis=0)
     start = points[order[np.flatnonzero(order != np.roll(order, 1))]] if np.ptp(order) else points[order[:1]]
     edge = np.roll(start, -1, axis=0) - start

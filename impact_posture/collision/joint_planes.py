@@ -18,7 +18,8 @@ from impact_posture.system.arrays import Array
 _TRIED, _MOST_JOINTS = 25, 3
 # Half of the largest range of a joint, rad (m), so that the step of the grid is at most half a radian.
 _MOST_HALF = 6.5
-# Largest number of planes of a pair of bodies, and smallest fraction of free positions that must remain.
+# Largest number of planes of a pair of bodies.  Smallest fraction that must remain of the free positions, where the
+# shapes do not touch.
 _MOST_PLANES, _LEFT = 12, 1 / 3
 # The cost of a plane is the number of removed free positions, plus this fraction of all free positions.
 _WORTH = 0.05
@@ -43,9 +44,9 @@ def joint_planes(
 ) -> JointPlanes | None:
     """Return planes that keep the shapes of two bodies apart, or ``None`` if the search fails.
 
-    The shapes are checked on a grid over the ranges of the joints between the bodies.  Planes remove the positions
-    where the shapes touch, with their grid cells.  Each step adds the plane with the highest ratio of removed
-    touching positions to removed free positions.  ``touch`` tells whether the shapes touch at given placements.
+    The shapes are checked on a grid over the ranges of the joints between the bodies.  Planes remove the grid cells
+    around the positions where the shapes touch.  Each step adds the plane with the highest ratio of removed touching
+    positions to removed free positions.  ``touch`` tells whether the shapes touch at given placements.
     """
     model, start = robot.model, robot.posture()
     lowest, highest = model.lowerPositionLimit, model.upperPositionLimit

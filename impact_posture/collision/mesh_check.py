@@ -55,7 +55,7 @@ class MeshCheck:
     def collisions(
         self, q: Array, obstacles: Sequence[Standing] = (), planes: Sequence[HalfSpace] = ()
     ) -> list[tuple[str, str]]:
-        """Return the names of the two shapes in each collision at a posture, shape (nq,).
+        """Return the names of the two shapes of each collision at posture ``q``, shape (nq,).
 
         The shapes must not touch each other or the obstacles, and must stay in front of the planes.
         """
@@ -90,7 +90,7 @@ class MeshCheck:
         return self._data.oMi[self._joints[index]] * self._shapes[index].placement
 
     def _within(self, away: Array, exempt: Collection[int]) -> Array:
-        """Return, as a column, whether the ball around each shape reaches a body at the distance ``away``."""
+        """Return a column: whether the ball around each shape reaches a body at the distance ``away``."""
         allowed = np.array([joint not in exempt for joint in self._joints])
         return np.asarray((away <= self._reach) & allowed)[:, None]
 

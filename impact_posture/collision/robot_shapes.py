@@ -33,10 +33,11 @@ class FittedShapes:
     Attributes:
         bodies: Swept hulls that contain all shapes.
         pairs: Pairs of bodies that must not touch, as indices into ``bodies``, shape (k, 2).
-        always_touching: Names of shapes that touch at the default posture and at more than half of random postures.
-            These shapes overlap by design, so their contact is allowed.
+        always_touching: Names of shapes that touch at the default posture and at more than half of 1,000 random
+            postures.  These shapes overlap by design, so their contact is allowed.
         joint_planes: Bounds on joints for nested bodies (:func:`nested_pairs`), which ``pairs`` leaves out.
-        hulls_touching: Names of nested bodies without such bounds.  Only :class:`MeshCheck` detects their collisions.
+        hulls_touching: Names of nested bodies without such bounds on joints.  Only :class:`MeshCheck` detects their
+            collisions.
         links: Links whose shapes are used.
         warnings: Warnings about shapes, one line each.
     """
@@ -54,8 +55,8 @@ class FittedShapes:
 class RobotShapes(FittedShapes):
     """Collision shapes with their robot, which loads the shapes of the URDF on demand.
 
-    ``without_shapes`` names each link none of whose shapes can be used, and the first link of each joint that moves a
-    mass but no shape.
+    ``without_shapes`` names the links for which the URDF describes only unusable shapes.  It also names the first
+    link of each joint that moves a mass but no shape.
     """
 
     robot: Robot
@@ -124,7 +125,7 @@ def _source(robot: Robot) -> _Source:
 
 
 def shape_warnings(robot: Robot) -> tuple[str, ...]:
-    """Return the warnings of :func:`load_shapes`, without the hulls, which take longer.
+    """Return the warnings of :func:`load_shapes` without computing hulls, which takes longer.
 
     Raises:
         UrdfError: As in :func:`load_shapes`.

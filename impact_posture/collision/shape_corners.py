@@ -28,7 +28,7 @@ Triangles = NDArray[np.int_]
 
 
 class Corrected(NamedTuple):
-    """A coal mesh, and whether it is exactly the mesh in the file, or else its convex hull."""
+    """A coal mesh, and whether it is exactly the mesh in the file; otherwise it is the convex hull of that mesh."""
 
     mesh: Any
     exact: bool

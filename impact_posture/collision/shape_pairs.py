@@ -16,7 +16,7 @@ from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import locate, srdf_path
 from impact_posture.system.arrays import Array
 
-# Numbers of random postures in mostly_touching and in nested_pairs.
+# Number of random postures in mostly_touching, and in nested_pairs.
 _POSTURES = 1000
 _COUNTED = 100
 _SEED = 0

@@ -19,7 +19,7 @@ from impact_posture.system.arrays import Array
 MOST_VERTICES = 40
 """Largest number of vertices of a hull, because every vertex adds a constraint to the optimization."""
 
-# Points are flat if their extent (m) in a direction is smaller.  Half thickness of the hull of flat points.
+# Points with a smaller extent (m) in a direction are flat.  Also half the thickness of the hull of flat points.
 _THIN = 1e-4
 _REQUEST = coal.DistanceRequest(True)
 _REQUEST.gjk_tolerance = 1e-12
@@ -138,7 +138,8 @@ def transform(placement: pin.SE3) -> Any:
 def hull_corners(points: Array) -> Array:
     """Return the corners of the convex hull of points, shape (k, 3).
 
-    Flat points are replaced by a slab of 0.2 mm thickness, points on a line by its ends, and close points by one.
+    A slab of 0.2 mm thickness replaces flat points.  The two end points replace points on a line, and one point
+    replaces points closer than 0.1 mm.
     """
     middle = points.mean(axis=0)
     axes = np.linalg.eigh((points - middle).T @ (points - middle))[1]
@@ -174,8 +175,9 @@ class Fit(NamedTuple):
 def fit_hull(points: Array, tolerance: float = _TOLERANCE) -> Fit:
     """Fit a sphere-swept convex hull that contains points, shape (n, 3), m.
 
-    Each step adds the corner farthest from the hull, until all corners are within ``tolerance`` (m) or the hull has
-    40 corners.  The sweep radius is the largest distance of a point from the hull.
+    Candidates are the corners of the convex hull of the points.  Each step adds the candidate farthest from the
+    fitted hull.  The steps end if all candidates are within ``tolerance`` (m) of the fitted hull, or if it has 40
+    corners.  The sweep radius is the largest distance of a point from the fitted hull.
     """
     corners = hull_corners(points)
     candidates = corners[:: -(-len(corners) // _MOST_CANDIDATES)]
@@ -212,7 +214,7 @@ def _extreme(points: Array) -> Array:
 
 
 def _outside(points: Array, hull: SweptHull) -> Array:
-    """Return the points outside a hull.  Chunks of points limit the memory for a million points."""
+    """Return the points outside a hull.  Points are checked in chunks, to limit the memory for a million points."""
     if not len(hull.faces):
         return points
     corners = hull.vertices[hull.faces] - hull.center

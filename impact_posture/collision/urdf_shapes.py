@@ -44,7 +44,7 @@ class UrdfShapes(NamedTuple):
 
     Attributes:
         shapes: Shapes whose description can be used.
-        warnings: A warning for each other shape.
+        warnings: A warning for each shape whose description cannot be used.
         described: Links for which the URDF describes a shape, even if no shape of the link can be used.
     """
 
@@ -188,7 +188,7 @@ def _read(
 
 
 def _color(material: ET.Element | None, named: Mapping[str, ET.Element]) -> tuple[float, ...] | None:
-    """Return the color of a shape or of its named material; ``None`` without a valid color."""
+    """Return the color in a material tag, or else in the named material; ``None`` if there is no valid color."""
     for tag in () if material is None else (material, named.get(material.get("name", ""))):
         color = None if tag is None else tag.find("color")
         if color is not None:

@@ -112,7 +112,7 @@ def hint_for(value: object, annotation: Any) -> str:
 
 
 def _fits(value: object, annotation: Any) -> bool:
-    """Return whether a value has an annotated type; true for annotations that this module does not know."""
+    """Return whether a value has the annotated type; true for annotations that this module does not know."""
     import numpy as np
     from numpy.typing import ArrayLike
 

@@ -55,8 +55,8 @@ TransmissionKind = Literal["rigid", "elastic", "locked"]
 # Gere lists 0.0007 to 0.004 GPa.
 MATERIALS = {"steel": (200e9, 0.28), "wood": (11.5e9, 0.3), "rubber": (0.03e9, 0.48), "ground": (24e9, 0.15)}
 
-# Default distance (m) between links that must not touch.  Default edge length (m) of a square surface: the robot may
-# stand behind its plane.
+# Default least distance (m) between links that must not touch.  Default edge length (m) of a square surface, which
+# replaces the endless plane if a foot or a fixed base is behind this plane.
 CLEARANCE, PATCH = 0.001, 0.3
 # Default friction coefficient (Coulomb).
 FRICTION = Unstated(0.7)
@@ -64,7 +64,7 @@ FRICTION = Unstated(0.7)
 STARTS, SCREENED = 16, 1024
 # Number of bounds if --tradeoff is given without a number.
 TRADEOFF_POINTS = 16
-# Default approach speed (m/s) and coefficient of restitution of predicted jumps.
+# Default approach speed (m/s), and default coefficient of restitution, of predicted impacts.
 SPEED, RESTITUTION = Unstated(1.0), 0.0
 
 
@@ -166,7 +166,7 @@ class ImpactSettings(RobotSettings):
         None, "Lowest and highest factor on the armature; the worst case is used.", METRIC, "LOW HIGH", "as stated"
     )
     payload: Payloads = setting(
-        (), "Mass at a frame that the robot may carry, kg; the worst case is used; repeatable.", METRIC, "FRAME MASS",
+        (), "Possible payload: frame and mass, kg; the worst case is used; repeatable.", METRIC, "FRAME MASS",
         parse=parse_payloads, repeatable=True,
     )  # fmt: skip
     posture: str | None = setting(
@@ -255,13 +255,13 @@ class ProblemSettings(ImpactSettings):
     )  # fmt: skip
     obstacles: tuple[Obstacle, ...] = ()
     limit_margin: NonNegative | None = setting(
-        None, "Distance from the joint limits, rad or m.", LIMITS, words="from robot.toml"
+        None, "Least distance from the joint limits, rad or m.", LIMITS, words="from robot.toml"
     )
     regularization: NonNegative = setting(0.0, "Weight of the distance from the start.", TASK)
     tradeoff: ZeroOrMore = setting(
         0, f"Best posture within each of K distances from the start; K is {TRADEOFF_POINTS} if left out.", TASK, "[K]"
     )
-    tradeoff_against: Against = setting("distance", "What --tradeoff bounds: distance, or peak force.", TASK)
+    tradeoff_against: Against = setting("distance", "Quantity that --tradeoff bounds: distance, or peak force.", TASK)
     path: bool = setting(
         False, "Find a timed path from the start to the optimum, on which all constraints hold.", TASK
     )

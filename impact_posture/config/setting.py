@@ -8,11 +8,11 @@ from typing import Any
 
 
 class Unstated(float):
-    """A default number, which can be told from the same number that a user states."""
+    """Default number of a setting.  A number that the user gives has another type, even with the same value."""
 
 
 def stated(value: float | str | None) -> bool:
-    """Return whether a user stated a setting: it is neither ``None`` nor a default number."""
+    """Return whether the user set a value: it is neither ``None`` nor of the type :class:`Unstated`."""
     return value is not None and not isinstance(value, Unstated)
 
 
@@ -30,7 +30,7 @@ class Setting:
         takes: Placeholder of the value in ``--help``.
         words: Description of the default value, if the default is not a constant.
         option: Spelling of the option, if it differs from the name of the field.
-        parse: Function that converts all texts given for the option to the value.
+        parse: Function that converts the text of the option to the value; for a repeatable option, the list of texts.
         repeatable: Whether the option may be given several times.
     """
 

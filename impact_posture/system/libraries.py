@@ -1,8 +1,8 @@
 """Build, load and cache shared libraries.
 
 Loading a library runs its code, and loading a truncated library can end the process.  Therefore this module writes
-a SHA-256 file beside each library that it builds.  :func:`load_library` refuses a library with another SHA-256.  Only
-the user can write to the cache.
+a SHA-256 file beside each library that it builds.  :func:`load_library` refuses a library whose SHA-256 differs from
+this file.  Only the user can write to the cache.
 """
 
 from __future__ import annotations

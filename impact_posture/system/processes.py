@@ -91,7 +91,7 @@ def _worker(index: int) -> tuple[int, Any]:
 
 @contextmanager
 def fork_map(function: Callable[[int], _Result], count: int, jobs: int) -> Iterator[Iterator[tuple[int, _Result]]]:
-    """Yield ``(index, function(index))`` for each index below ``count``, in the order in which they finish.
+    """Yield ``(index, function(index))`` for each index below ``count``, in the order in which the calls finish.
 
     The calls run in forked processes if ``jobs`` is more than one and the system can fork, else in this process, one
     after the other.  All workers end with the block, also after Ctrl-C. On Linux, all workers also end if this
@@ -180,7 +180,7 @@ def _send_result(function: Callable[[], Any], sender: Any) -> NoReturn:
 
 
 def depend(parent: int) -> None:
-    """Make a forked process ignore signals, except SIGTERM, by which pools end workers, and end with its parent."""
+    """Make a forked process end with its parent, and ignore signals except SIGTERM, with which pools end workers."""
     for number in ENDING:
         signal.signal(number, signal.SIG_DFL if number == signal.SIGTERM else signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING)

@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-# Function of the current activity and its finished fraction; ``None`` stands for an unknown fraction.
+# Function with the arguments activity and finished fraction; ``None`` stands for an unknown fraction.
 Listener = Callable[[str, float | None], None]
 
 _LISTENERS: list[Listener] = []
@@ -15,7 +15,7 @@ os.register_at_fork(after_in_child=_LISTENERS.clear)
 
 
 def tell(doing: str, share: float | None = None) -> None:
-    """Report an activity and its finished fraction to the newest listener, if there are any."""
+    """Report an activity and its finished fraction to the newest listener, if there is a listener."""
     if _LISTENERS:
         _LISTENERS[-1](doing, share)
 
