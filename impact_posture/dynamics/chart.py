@@ -40,8 +40,8 @@ class Chart:
 
     def __init__(self, model: pin.Model) -> None:
         self.slots: list[JointSlot] = []
-        # Index pairs (in q, in x).  copied: equal numbers.  angles: a cosine in q, which its sine follows, and the
-        # angle in x.
+        # Pairs of an index in q and an index in x.  ``copied`` is for equal numbers.  ``angles`` is for a cosine in
+        # q, which its sine follows, and the angle in x.
         copied: list[tuple[int, int]] = []
         angles: list[tuple[int, int]] = []
         start = 0
@@ -69,7 +69,7 @@ class Chart:
 
     @cached_property
     def bounded(self) -> tuple[list[int], list[int]]:
-        """Indices in ``v`` and in ``x`` of the coordinates that can have limits; ``v`` is the time derivative."""
+        """Indices, in ``v`` and in ``x``, of the coordinates that can have limits; for these, ``v = dx/dt``."""
         slots = [slot for slot in self.slots if slot.kind.family in BOUNDED]
         in_v = [k for slot in slots for k in range(slot.v.start, slot.v.stop)]
         return in_v, [k for slot in slots for k in range(slot.x.start, slot.x.stop)]

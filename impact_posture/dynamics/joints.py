@@ -67,7 +67,7 @@ def joint_kind(joint: pin.JointModel, name: str) -> JointKind:
 
 
 def joint_transform(kind: JointKind, q: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Return rotation (3, 3) and translation (3,) of the joint frame relative to its rest frame at ``q``."""
+    """Return rotation (3, 3) and translation (3,), at ``q``, of the joint frame relative to its rest frame."""
     rotation, translation = ca.SX.eye(3), ca.SX(3, 1)
     if kind.family in _TURNING:
         rotation = axis_rotation(*_cosine_sine(kind, q), axis=tuple(kind.axis.tolist()))

@@ -54,7 +54,7 @@ class _Motion:
 
 
 class JumpDerivatives:
-    """Derivatives of the jump equations at the configuration of ``tree``, which must have no extra inertias."""
+    """Derivatives of the jump equations at the configuration of ``tree``; ``tree`` must have no extra inertias."""
 
     def __init__(self, tree: Kinematics, feet: Sequence[Foot]) -> None:
         self._tree, self._feet = tree, tuple(feet)
@@ -162,7 +162,7 @@ class JumpDerivatives:
 
     @cached_property
     def _foot_motions(self) -> list[ca.SX]:
-        """Matrices, shape (rows, 6), from the velocity of a link to the velocity of the foot on this link."""
+        """Matrices, shape (rows, 6), that map the velocity of a link to the velocity of the foot on this link."""
         motions = []
         for foot in self._feet:
             R, p = self._places[foot.point.joint]
@@ -210,7 +210,7 @@ def _motion_of_link(R: ca.SX, p: ca.SX, motion: ca.SX) -> ca.SX:
 
 @template
 def _inertia_of_link(R: ca.SX, p: ca.SX, mass: ca.SX, lever: ca.SX, inertia: ca.SX) -> ca.SX:
-    """Return ``[I h; hᵀ m]``, ``h = m c``, ``I`` about the origin of the root link, and ``inertia`` about ``c``."""
+    """Return ``[I h; hᵀ m]`` about the origin of the root link, ``h = m c``; ``inertia`` is about ``c``."""
     c = p + R @ lever
     h = mass * c
     about_root = symmetric(R @ symmetric(inertia) @ R.T + ca.dot(h, c) * ca.SX.eye(3) - h @ c.T)

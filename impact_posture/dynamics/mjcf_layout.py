@@ -55,8 +55,8 @@ class MjcfLayout:
         self._chart = chart = Chart(model)
         self.nqpos, self.nv, self.nq = chart.nx, chart.nv, chart.nq
         self.slots: list[MjcfSlot] = []
-        # places: index of the chart coordinate with the same value as each entry of qpos.  rates: index in v of each
-        # entry of qvel.
+        # For each entry of qpos, ``places`` has the index of the chart coordinate with the same value.  For each
+        # entry of qvel, ``rates`` has its index in v.
         places: list[int] = []
         rates: list[int] = []
         for i in order:

@@ -46,7 +46,7 @@ class ModelParameters(RepeatedLimbs):
 
 
 def without_parameters(robot: Robot) -> Robot:
-    """Return the robot with one in place of all nonzero parameters.  Robots with equal results share code."""
+    """Return the robot with all nonzero parameters set to one.  Robots with equal results share code."""
     model, armature = robot.model.copy(), np.array(robot.model.armature)
     finite = np.isfinite(armature)
     armature[finite] = rounded(armature[finite]) != 0.0

@@ -96,7 +96,7 @@ def motion_cross_force(motion: ca.SX, force: ca.SX) -> ca.SX:
 
 @dataclass(frozen=True)
 class Spin:
-    """Rotation about a coordinate axis, stated by the cosine and sine of its angle.
+    """Rotation about a coordinate axis, given by the cosine and sine of the angle.
 
     ``axis`` is 0, 1 or 2.  ``sense`` is −1 if the joint axis points opposite to the coordinate axis, else 1; ``sine``
     already includes this sign.
@@ -139,7 +139,8 @@ def spin_power(inertia: ca.SX, x: ca.SX, y: ca.SX, *, axis: int, sense: float) -
 def inertia_to_parent(inertia: ca.SX, R: ca.SX, p: ca.SX, *spin: ca.SX, axis: int | None = None) -> ca.SX:
     """Return a symmetric 6×6 inertia of a child in the coordinates of its parent.
 
-    ``spin`` contains the cosine and sine of a rotation about the coordinate ``axis`` 0, 1 or 2, before ``R``.
+    ``spin`` contains the cosine and sine of a rotation about the coordinate ``axis`` (0, 1 or 2), which is applied
+    before ``R``.
     """
     blocks = [symmetric(inertia[:3, :3]), inertia[:3, 3:], symmetric(inertia[3:, 3:])]
     if axis is not None:

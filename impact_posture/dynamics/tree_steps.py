@@ -19,7 +19,7 @@ def pivot(inertia: ca.SX, S: ca.SX, armature: ca.SX) -> ca.SX:
 
 @template
 def reduce(inertia: ca.SX, S: ca.SX, pivot: ca.SX) -> tuple[ca.SX, ...]:
-    """Return the gain ``D⁻¹SᵀI``, shape (nv, 6), and the inertia that the parent link meets, ``I − I S D⁻¹SᵀI``."""
+    """Return the gain ``D⁻¹SᵀI``, shape (nv, 6), and the inertia passed to the parent, ``I − I S D⁻¹SᵀI``."""
     U = inertia @ S
     gain = _solve(pivot, U.T)
     return gain, symmetric(inertia - U @ gain)

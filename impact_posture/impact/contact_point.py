@@ -1,4 +1,4 @@
-"""The contact point of an impact beside the foremost point of its links, which touches a surface first."""
+"""Compare the contact point of an impact with the foremost point of its links, which touches a surface first."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class EarlyTouch:
 
     @property
     def fact(self) -> str:
-        """What is touched first, without a hint."""
+        """Description of the link that is touched first, without a hint."""
         beyond = f"{1e3 * self.front.reach:.0f} mm beyond the contact point at {self.contact.frame}"
         return f"a flat surface touches {self.front.link} first, {beyond}"
 
@@ -38,9 +38,9 @@ class EarlyTouch:
 
 
 def front_of(robot: Robot, contact: ImpactContact, q: Array, held: Sequence[str] = ()) -> ContactFront | None:
-    """Return the foremost point along −n at the posture ``q``, shape (nq,), if the joints ``held`` do not move.
+    """Return the foremost point, along −n, of the links at the contact; the joints ``held`` do not move.
 
-    ``None`` if the links at the contact have no shapes.
+    ``q`` is the posture, shape (nq,).  Return ``None`` if these links have no shapes.
     """
     direction = -np.array(contact.normal)
     if contact.normal_frame == "world":

@@ -17,7 +17,7 @@ from impact_posture.system.arrays import Array
 
 
 class EffectiveMassKind(CoulombKind):
-    """``m = nᵀp``, kg: the normal impulse per approach speed with the friction of the contact."""
+    """Effective mass with friction, ``m = nᵀp``, kg: the normal impulse per approach speed."""
 
     def value(self, q: Array) -> float:
         """Return the effective mass at ``q``, kg, computed with Pinocchio."""
@@ -35,7 +35,7 @@ class EffectiveMassKind(CoulombKind):
 
 
 class EffectiveMassObjective(WorstCaseObjective):
-    """The effective mass with friction of the leading contact, kg; the peak force increases with it."""
+    """The effective mass, with friction, of the leading contact, kg; the peak force increases with this mass."""
 
     @staticmethod
     def of(objective: WorstCaseObjective) -> EffectiveMassObjective:

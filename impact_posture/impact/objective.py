@@ -20,7 +20,7 @@ from impact_posture.system.arrays import Array
 
 @dataclass(frozen=True, eq=False)
 class Subgradients:
-    """Gradients whose convex hull is the subdifferential of an objective ``f = max_i f_i``.
+    """Gradients whose convex hull is the subdifferential of a function ``f = max_i f_i``.
 
     Attributes:
         gradients: Tangent gradients of the functions ``f_i`` that are near the maximum, one per row, shape (k, nv).

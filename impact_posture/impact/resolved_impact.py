@@ -27,7 +27,7 @@ from impact_posture.robot.robot_loader import load_robot
 from impact_posture.robot.robot_spec import Support
 from impact_posture.system.arrays import Array
 
-# Without a stated objective, each of these settings selects ``auto``.
+# If the user chooses no objective, each of these settings selects ``auto``.
 _CHOOSING = ("speed", "friction", "contact_stiffness", "contact_duration")
 
 FLOATS = "because its data name neither feet nor rotors"
@@ -151,7 +151,7 @@ class ResolvedImpact:
         posture: Name or file of the posture ``q``.
         speed: Approach speed, m/s.
         restitution: Coefficient of restitution.
-        missing_support: Hint how to give supports if the robot floats and no supports are given; otherwise empty.
+        missing_support: Hint how to give supports, if the robot floats and no supports are given; otherwise empty.
         contact_stiffness: Elasticity of the contact; ``None`` if not known.
         choice: Reason why ``auto`` chose this objective; empty if the settings name the objective.
         held: Joints that keep their values.

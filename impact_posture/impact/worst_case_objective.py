@@ -113,7 +113,7 @@ class WorstCaseObjective:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Warnings about metrics with which the objective has a degenerate meaning."""
+        """Warning if the metric makes the objective equal, or nearly equal, to ``G`` or ``1/G``."""
         if self.metric.kind != "kinetic":
             return ()
         # With support impulses f, aᵀMa = G − ε‖f‖².  Without supports, aᵀMa = G.
@@ -225,7 +225,7 @@ class WorstCaseObjective:
         return self.subgradients(q).first
 
     def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
-        """Return the gradients of all cases (normals, impulses, models) at most ``within`` below the maximum."""
+        """Return the gradients for the normals, impulses and models at most ``within`` below the maximum."""
         return self.worst_case.subgradients(q, within)
 
     def movable(self, q: Array) -> bool:

@@ -46,7 +46,7 @@ class Hover:
     joint_torques: Array
     """Torques of all joints behind the base, N·m (N for a prismatic joint)."""
     thrust_margin: float
-    """Smallest distance of a thrust from its limits, divided by the range: at most 0.5; negative if outside."""
+    """Smallest distance of a thrust from a limit, divided by the thrust range; negative outside the limits."""
     torque_margin: float
     """Smallest ``1 - |τ|/τ_max`` of all joints; 1 without joints."""
     residual: float
@@ -62,7 +62,7 @@ class Hover:
 
 @dataclass(frozen=True)
 class LateralForce:
-    """Largest net horizontal force without tilt or rotation in each direction, N; NaN if the robot cannot hover.
+    """Largest net horizontal force in each of four directions, without tilt, N; NaN if the robot cannot hover.
 
     The force acts through the center of mass, and the arm does not move.  Forward and left are the x and y axes of
     the base, projected on the horizontal plane.
@@ -222,7 +222,7 @@ def lateral_force_range(model: pin.Model, propulsion: PropulsionSpec, q: ArrayLi
 
 
 def _centred_thrusts(matrix: Array, wrench: Array, low: float, high: float) -> Array:
-    """Return the thrusts with ``A f = w`` farthest from their limits, or else least-squares thrusts within them."""
+    """Solve ``A f = w`` for the thrusts farthest from their limits, or else by least squares within the limits."""
     count = matrix.shape[1]
     if count == 6 and np.linalg.matrix_rank(matrix) == 6:
         return np.asarray(np.linalg.solve(matrix, wrench))

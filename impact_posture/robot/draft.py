@@ -22,7 +22,8 @@ from impact_posture.robot.urdf import EXAMPLE_PREFIX, example_robot_data, resolv
 from impact_posture.system.escape import toml
 from impact_posture.system.output_folder import check_name
 
-# Smallest number of joints that lead to the contact frame, and the guessed contact pose, which leaves some freedom.
+# Smallest number of joints that lead to the contact frame, and the contact pose that is then guessed.  The guessed
+# pose leaves some freedom of motion.
 _POSES = ((7, "full"), (6, "aligned"), (4, "position"), (0, "free"))
 # Smallest distance (m) of the center of mass from the edges of the support polygon for com_over_feet.
 _LEAST_DEPTH = 0.02

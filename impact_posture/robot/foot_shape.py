@@ -29,7 +29,7 @@ _UPRIGHT = float(np.cos(np.radians(1.0)))
 
 
 def support(robot: Robot, frame: str, urdf: Path, *, flat: bool) -> Support:
-    """Return a foot with the contact point or the sole of its boxes, cylinders and balls.
+    """Return a foot; its boxes, cylinders and balls determine its contact point or sole.
 
     A foot without such shapes becomes a surface if ``flat``, else a point.
     """

@@ -161,7 +161,7 @@ def srdf_near(urdf: Path) -> Path | None:
 
 
 def srdf_end_effectors(srdf: Path | None) -> Mapping[str, str]:
-    """Return the attribute values, as text, of each end-effector link in the SRDF."""
+    """Return end-effector link → attribute values, as lower-case text, from the SRDF."""
     tags = ET.parse(srdf).getroot().iter("end_effector") if srdf is not None else ()
     return {tag.get("parent_link", ""): " ".join(tag.attrib.values()).lower() for tag in tags}
 

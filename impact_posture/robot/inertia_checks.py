@@ -26,7 +26,8 @@ _SINGULAR = 1e-12
 def check_inertias(root: ET.Element, model: pin.Model, path: Path, accept: bool) -> tuple[str, ...]:
     """Raise an error for links with impossible masses or inertias; return warnings.
 
-    An error becomes a warning if ``accept``, or if it is negligible in the inertia of the body of the link.
+    An error becomes a warning if ``accept`` is true, or if the error is negligible beside the inertia of the body
+    that contains the link.
 
     Raises:
         InertiaError: A mass is negative, a link without mass has moments, or moments break the triangle inequality.

@@ -54,7 +54,7 @@ def movable_joints(model: pin.Model) -> list[str]:
 
 
 def rigid_groups(model: pin.Model, held: Sequence[str]) -> list[int]:
-    """Return the group number of each joint; links of one group are one body if ``held`` do not move."""
+    """Return the group number of each joint; links of one group are one body if the joints ``held`` do not move."""
     group = list(range(model.njoints))
     for joint in range(1, model.njoints):
         if model.names[joint] in held:

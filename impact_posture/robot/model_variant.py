@@ -51,10 +51,10 @@ class ModelVariant:
 def build_model_variants(
     robot: Robot, armature_range: Factors | None, payloads: Sequence[Payload]
 ) -> tuple[ModelVariant, ...]:
-    """Return the combinations of the factors 1, lowest and highest on the armature with no payload and each payload.
+    """Return all combinations of an armature factor (1, lowest or highest) and a payload (none, or one of them).
 
     ``armature_range`` contains the lowest and the highest factor.  The first variant is the unchanged robot.  The
-    result is empty without a range and payloads.
+    result is empty if there are neither a range nor payloads.
 
     Raises:
         InputError: A range or mass is invalid, the armature is zero, or there are too many variants.

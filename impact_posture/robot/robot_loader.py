@@ -42,7 +42,7 @@ def load_robot(robot: str, options: LoadOptions | None = None, **settings: Any) 
             example ``root="fixed"``.
 
     Raises:
-        RobotNotFound: No robot has this name; carries the nearest names.
+        RobotNotFound: No robot has this name; the error lists the nearest names.
         UrdfError: The URDF or SRDF cannot be used.
         SpecError: The robot.toml cannot be used.
     """
@@ -96,7 +96,7 @@ def _check_package_dirs(folders: Sequence[str], base: Path, where: str) -> None:
 
 
 def names_a_path(robot: str, folder: Path) -> bool:
-    """Tell whether ``robot`` is a path (from ``folder``) and not a known name or an example-robot-data URI."""
+    """Return whether ``robot`` is a path (from ``folder``), not a known name or an example-robot-data URI."""
     if robot.startswith(EXAMPLE_PREFIX) or robot in known_robots():
         return False
     return robot.endswith((".urdf", ".xml", ".xacro")) or "/" in robot or os.path.isfile(folder / robot)
@@ -140,7 +140,7 @@ def locate(robot: str, options: LoadOptions) -> Located:
         source = text if text.startswith(EXAMPLE_PREFIX) else f"impact-posture:{robot}/{text}"
         urdf = resolve_path(text, base)
         if options.config:
-            # The file of this package provides what the user's file does not state.
+            # The robot.toml of this package provides the values that the user's file leaves out.
             spec, base = read_spec(Path(options.config), over=shipped), Path(options.config).parent
             chosen = resolve_path(spec.model.urdf or text, base)
             if chosen != urdf:
@@ -218,7 +218,7 @@ def _check_limits(model: pin.Model, source: str) -> None:
 
 
 def _named(model: pin.Model, patterns: Sequence[str], where: str) -> tuple[str, ...]:
-    """Return the joints that names or patterns select, without repetition; each has to select a joint."""
+    """Return the joints that names or patterns select, without repetition; each name has to select a joint."""
     known = movable_joints(model)
     selected: dict[str, None] = {}
     for pattern in patterns:

@@ -62,8 +62,8 @@ class Support(_Table):
     """A foot that stays on the ground during an impact.
 
     Attributes:
-        kind: ``point`` keeps the velocity of the contact point at zero; ``surface`` also the angular
-            velocity.
+        kind: ``point`` keeps the velocity of the contact point at zero.  ``surface`` also keeps the angular velocity
+            at zero.
         offset: Contact point relative to the origin of the frame, in the frame, meters.
         size: Half extents (x, y) of the sole around the contact point, in the frame, meters.
     """
@@ -97,7 +97,7 @@ class ConstraintSpec(_Table):
 
 @dataclass(frozen=True)
 class LimitSpec(_Table):
-    """Limits by joint that replace the limits of the URDF: rad or m, rad/s or m/s, N·m or N."""
+    """Limits of named joints, which replace the limits of the URDF: rad or m, rad/s or m/s, N·m or N."""
 
     position: dict[str, tuple[float, float]] = field(default_factory=dict)
     velocity: dict[str, Positive] = field(default_factory=dict)

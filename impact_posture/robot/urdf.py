@@ -26,7 +26,7 @@ EXAMPLE_PREFIX = "example-robot-data:"
 
 @cache
 def example_robot_data() -> Path:
-    """Return ``robots/`` of the package example-robot-data; raise ``PackageNotFound`` if it is not installed."""
+    """Return the folder ``robots/`` of example-robot-data; raise ``PackageNotFound`` without this package."""
     from importlib.metadata import PackageNotFoundError
     from importlib.metadata import files as dist_files
 

@@ -1,4 +1,4 @@
-"""Compression time and peak force of a contact, and the joint inertia (links, or links and rotors) that responds.
+"""Compression time and peak force of a contact, and a ratio that tells whether the rotors respond to the impact.
 
 An effective mass ``m`` that meets a contact at the speed v comes to rest after the time T.  At T, the compression δ
 and the normal force reach their maxima; the largest force is F:
@@ -62,7 +62,7 @@ class ContactStiffness:
 
     @staticmethod
     def of(stiffness: float | str | None, duration: float | None) -> ContactStiffness | None:
-        """Return the contact that the two settings describe; ``None`` if both are ``None``.
+        """Return the elasticity that the two settings describe; ``None`` if both settings are ``None``.
 
         ``stiffness`` is the setting ``contact_stiffness``, and ``duration`` the setting ``contact_duration``.
 
@@ -135,13 +135,13 @@ class Compression:
 
     Attributes:
         contact: Elasticity of the contact; ``None`` if not known.
-        mass: Effective mass m along the normal with the friction of the contact, kg, with the inertia of the
-            objective's joint model.
+        mass: Effective mass m with friction, kg: normal impulse per approach speed.  The joint model of the objective
+            determines the inertia.
         time: Compression time T, s, for this mass; ``None`` if not known.
         peak_force: Largest normal force F, N, for this mass; ``None`` if not known.
         x: Ratio ``T/√(m C)``, with T and m of the links alone; ``None`` if the contact or the springs are unknown.
         by_material: Name of a material → x for a contact with this material; empty unless the springs are known and
-            the contact is not.
+            the contact is unknown.
         joint_model: The joint model of the objective.
         unknown_springs: Joints that the impact moves and whose springs are unknown, although other springs are known.
             Then x is unknown.
@@ -205,7 +205,7 @@ class Compression:
 def compression(
     objective: WorstCaseObjective, q: Array, speed: float, contact: ContactStiffness | None
 ) -> Compression | None:
-    """Return compression time, peak force and x of the impact at the leading contact, with its friction.
+    """Return compression time, peak force and x of the impact, with friction, at the leading contact.
 
     Return ``None`` if all are unknown, or if the contact point cannot move as the friction demands.  ``q`` has shape
     (nq,), and ``speed`` is the approach speed, m/s.  If ``contact`` is ``None``, x is computed for every material in
@@ -235,9 +235,9 @@ def compression(
 
 
 def contact_mass(oracle: ImpactOracle, q: Array) -> float | None:
-    """Return the effective mass along the normal with friction at ``q``, kg.
+    """Return the effective mass with friction at ``q``, kg: normal impulse per approach speed.
 
-    Return ``None`` if it is unbounded, because the contact point cannot move along the normal, or not without the
+    Return ``None`` if the mass is unbounded: the contact point cannot move along the normal, or can only move with a
     slip that the friction prevents.
     """
     if oracle.quantities(q).blocked:

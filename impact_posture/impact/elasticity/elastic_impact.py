@@ -45,7 +45,7 @@ _SOFTEST, _STIFFEST = 1.0, 1e12
 _LONGEST = 1e8
 # Stiffness that replaces rigid feet in the compliance, relative to the stiffest spring.
 _HELD = 1e8
-# Phase step between the samples for the peaks, rad of the fastest oscillation; fewest and most samples.
+# Step between the samples for the peaks, rad of the fastest oscillation; smallest and largest number of samples.
 _SAMPLE, _FEWEST, _MOST = 0.1, 100, 20_000
 
 

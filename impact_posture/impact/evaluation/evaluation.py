@@ -64,16 +64,17 @@ class Evaluation:
         cone: Worst case over the cone of normals, world axes; ``None`` if there is no cone or no objective value.
         ellipsoid: Dynamic impact ellipsoid ``Λ_c``.
         pose: World placement of the contact frame.
-        speed: Approach speed of the predicted jumps, m/s.
-        restitution: Coefficient of restitution of the predicted jumps.
+        speed: Approach speed of the predicted impact, m/s.
+        restitution: Coefficient of restitution of the predicted impact.
         frictionless: Jump without friction; ``None`` if the contact cannot move along the normal.
         sticking: Jump if the contact point sticks; ``None`` if S does not exist at ``q``.
         coulomb: Jump with the friction of the contact, which sticks or slides; ``None`` if there is no such jump.
-        together: Jump of a plastic impact of all contacts at once with friction, one entry per contact.  ``None`` for
-            one contact, for contacts that can pull, or if the iteration does not converge.
+        together: Jump of a plastic impact, with friction, at all contacts at once; one entry per contact.  ``None``
+            for one contact, for contacts that can pull, or if the iteration does not converge.
         energy_loss: Energy that the frictionless impact dissipates, J; ``None`` if the contact cannot move along the
             normal.
-        contact_mass: Effective mass along the normal with friction, kg; ``None`` if it is unbounded.
+        contact_mass: Effective mass with friction, kg: normal impulse per approach speed; ``None`` if it is
+            unbounded.
         compression: Compression time, peak force and the ratio x; ``None`` if all of them are unknown.
         elastic: Response of links, rotors and springs to the contact; ``None`` unless the joint model is ``elastic``.
         joint_yield: How the joints move the contact along the normal; ``None`` if no joint moves it.

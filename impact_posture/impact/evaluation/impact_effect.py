@@ -1,4 +1,4 @@
-"""What a robot feels of a velocity jump: the jump of its base, and of the joint nearest to its velocity limit."""
+"""Effect of a velocity jump on the robot: the jump of the base, and the jump of the joint nearest to its limit."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ class WorstJoint:
 
     Attributes:
         name: Name of the joint.
-        velocity: Size of its velocity jump, in ``unit``.
+        velocity: Size of the velocity jump of this joint, in ``unit``.
         unit: ``rad/s`` or ``m/s``.
-        share: Share of its velocity limit; ``None`` if no joint has a limit.  Then the joint has the largest jump in
-            rad/s, or in m/s if no joint turns.
+        share: Velocity jump divided by the velocity limit of this joint; ``None`` if no joint has a limit.  Then the
+            joint has the largest jump in rad/s, or in m/s if no joint turns.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""How far the joints can move the contact along its normal: in a singular direction, they cannot yield."""
+"""Speed with which the joints can move the contact along its normal; in a singular direction, they cannot yield."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.model_joints import v_slice
 from impact_posture.system.arrays import Array, null_space
 
-# The direction is singular if the joints move the contact along the normal by less than this share of the motion in
-# their best direction.  A singular value of the feet below the second share is a rounding error.
+# The direction is singular if the speed along the normal is below the first fraction of the largest speed in any
+# direction.  A singular value of the feet below the second fraction of the largest is a rounding error.
 _SINGULAR, _RANK = 0.05, 1e-9
 
 
 @dataclass(frozen=True)
 class JointYield:
-    """Motion of the contact per unit joint velocity ``‖v‖ = 1``, with feet in place and without other base motion.
+    """Speed of the contact for a joint velocity of norm 1; the feet do not move, the base only as the joints require.
 
     Attributes:
         along: Largest speed of the contact along the normal, m/rad: the singular value of ``nᵀJ`` of the joints.

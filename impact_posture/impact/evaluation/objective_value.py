@@ -66,8 +66,8 @@ def objective_value(objective: WorstCaseObjective, q: Array) -> float | None:
 def objective_gradient(objective: WorstCaseObjective, q: Array, value: float | None) -> Array | None:
     """Return the tangent gradient of the objective, shape (nv,); ``None`` if it does not exist at ``q``.
 
-    If members of a maximum tie, the result is a subgradient.  ``value`` is the objective at ``q`` from
-    :func:`objective_value`.
+    If several normals, impulses or models attain the maximum, the result is a subgradient.  ``value`` is the
+    objective at ``q`` from :func:`objective_value`.
     """
     values = np.linalg.eigvalsh(objective.oracle.quantities(q).mobility)
     singular = objective.kind == "sticking" and values[0] <= SINGULAR * values[-1]

@@ -1,4 +1,4 @@
-"""The predicted impact of a standing robot whose feet can lift and slide, beside the prediction that they stay."""
+"""The predicted impact of a standing robot whose feet can lift and slide."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from impact_posture.impact.friction.unilateral_impact import StandingFeet, longe
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.system.arrays import Array
 
-# The weight is not counted in a contact of unknown duration.  The search for the duration that would keep the feet
-# on the ground ends here, s, because no impact lasts longer.
+# The weight is not counted in a contact of unknown duration.  The search for the duration that would keep the feet on
+# the ground ends at this value, s: no impact lasts longer.
 _LONGEST = 0.1
 
 
@@ -25,10 +25,10 @@ class StandingImpact:
         jump: The velocity jump.
         lifts: Frames of the feet that lift or tip.
         slides: Frames of the feet that slide without lifting.
-        time: Time over which the feet carry the weight in this prediction, s: the compression time of the stated
-            contact, or zero if no contact is stated.
-        holding_time: Contact time from which on the weight keeps all feet in place, s; ``None`` if the time of the
-            contact is stated, if no foot moves, or if it is above 0.1 s.
+        time: Time over which the feet carry the weight in this prediction, s: the compression time of the contact, or
+            zero if this time or the weight on the feet is unknown.
+        holding_time: Shortest contact time at which the weight keeps all feet in place, s; ``None`` if the user gave
+            the contact time, if no foot moves, or if this time is above 0.1 s.
     """
 
     jump: Jump
@@ -44,7 +44,7 @@ class StandingImpact:
 
     @property
     def fact(self) -> str:
-        """What the impact does to the feet, in words."""
+        """Effect of the impact on the feet, in words."""
         counted = f" with the weight over the {1e3 * self.time:.2g} ms of the contact" if self.time > 0 else ""
         moved = (("lifts or tips", self.lifts), ("slides", self.slides))
         does = [f"{verb} {', '.join(frames)}" for verb, frames in moved if frames]

@@ -23,7 +23,7 @@ class Jump:
         norm: Norm ``‖Δν‖_W``.
         impulse: Impulse of the surface on the robot, world axes, shape (3,), N·s.
         normal_impulse: Part of the impulse along the normal, N·s.
-        effect: What base and joints feel.
+        effect: Jump of the base and of the worst joint.
         largest: Largest entries of ``Δν`` as ``(name, value, unit)``, in descending order.
     """
 
@@ -46,7 +46,7 @@ class Jump:
 
 
 def largest_entries(robot: Robot, values: Array) -> tuple[tuple[str, float, str], ...]:
-    """Return up to five entries of a tangent vector as ``(name, value, unit)``, the largest first.
+    """Return up to five entries of a tangent vector as ``(name, value, unit)``, in descending order of size.
 
     Entries below 0.1 % of the largest entry are omitted.
     """
@@ -55,7 +55,7 @@ def largest_entries(robot: Robot, values: Array) -> tuple[tuple[str, float, str]
 
 
 def _largest(sizes: Array, count: int) -> list[int]:
-    """Return the indices of up to ``count`` largest sizes, in descending order, without sizes below 0.1 %."""
+    """Return indices of the ``count`` largest sizes, in descending order; omit sizes below 0.1 % of the largest."""
     order = np.argsort(-sizes, kind="stable")[:count]
     return [int(k) for k in order if sizes[k] > 1e-3 * sizes[order[0]]]
 

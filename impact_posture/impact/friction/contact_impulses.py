@@ -1,9 +1,9 @@
 """Impulses of several contacts with Coulomb friction at the same time.
 
 Let ``u⁻`` be the velocities of the contact points before the impact, ``B = JM⁻¹Jᵀ``, and ``u = u⁻ + Bp`` the
-velocities after it.  At each contact, ``0 ≤ p_n ⊥ u_n ≥ 0`` and ``‖p_t‖ ≤ μ p_n``.  A point that slides has ``p_t =
-−μ p_n u_t/‖u_t‖``.  Pinocchio solves this problem by ADMM (Carpentier, Le Lidec and Montaut, From Compliant to Rigid
-Contact Simulation, 2024).
+velocities after the impact.  At each contact, ``0 ≤ p_n ⊥ u_n ≥ 0`` and ``‖p_t‖ ≤ μ p_n``.  A point that slides has
+``p_t = −μ p_n u_t/‖u_t‖``.  Pinocchio solves this problem by ADMM (Carpentier, Le Lidec and Montaut, From Compliant
+to Rigid Contact Simulation, 2024).
 """
 
 from __future__ import annotations
@@ -13,8 +13,9 @@ import pinocchio as pin
 
 from impact_posture.system.arrays import Array
 
-# Tolerance and largest number of iterations of ADMM, and its rules for the penalty.  The second rule is tried if the
-# first does not converge, which can happen for soles whose corners share their load in many ways.
+# Tolerance, largest number of iterations, and rules for the penalty of ADMM.  The second rule is tried if the
+# iteration with the first rule does not converge.  This can happen if the forces on the corners of a sole are not
+# unique.
 _TOLERANCE, _ITERATIONS = 1e-12, 20_000
 _RULES = (pin.ADMMUpdateRule.SPECTRAL, pin.ADMMUpdateRule.OSQP)
 # Largest error of impulses that fulfill the conditions, divided by the largest impulse.
@@ -22,7 +23,7 @@ _ERROR = 1e-7
 
 
 def contact_impulses(B: Array, before: Array, normals: Array, friction: Array) -> Array | None:
-    """Return the impulses, world axes, shape (m, 3); ``None`` if none fulfill the conditions.
+    """Return the impulses, world axes, shape (m, 3); ``None`` if no impulses fulfill the conditions.
 
     ``B`` has shape (3m, 3m).  ``before`` contains the velocities ``u⁻``, and ``normals`` the unit normals towards the
     robot, both in world axes with shape (m, 3).  ``friction`` has shape (m,).

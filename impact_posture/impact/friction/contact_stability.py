@@ -77,7 +77,7 @@ class ContactStability:
         return f"the feet stay with a friction coefficient of {self.friction:.2f} or more"
 
     def fault(self, friction: float) -> str:
-        """Return what the impact does to the feet at this friction coefficient; empty if all feet stay."""
+        """Return a text on the feet that do not stay at this friction coefficient; empty if all feet stay."""
         lifting = [foot.frame for foot in self.feet if foot.lifts]
         if lifting:
             return f"the impact lifts {', '.join(lifting)}"
@@ -96,7 +96,7 @@ class ContactStability:
 
 
 def contact_stability(oracle: ImpactOracle, supports: tuple[Support, ...], q: Array) -> ContactStability:
-    """Compute support impulses within the friction cones at ``q``, shape (nq,); if none exist, with the least pull.
+    """Compute support impulses within the friction cones at ``q``, shape (nq,); else the impulses of least pull.
 
     The ground is level, so the axis of every cone is world z.  A sole with a ``size`` transmits moments until its
     center of pressure reaches an edge.
@@ -127,9 +127,10 @@ def contact_stability(oracle: ImpactOracle, supports: tuple[Support, ...], q: Ar
 
 
 class FrictionCones:
-    """The friction cones as inequalities ``A f ≤ 0`` on the stacked impulses.
+    """The friction cones as inequalities ``A f ≤ 0`` on the stacked support impulses ``f``.
 
-    ``axes`` contains the world axes of the frame of each foot, shape (3, 3).  The size of a sole is along these axes.
+    ``axes`` contains the world axes of the frame of each foot, shape (3, 3).  The half extents of a sole are along
+    these axes.
     """
 
     def __init__(self, supports: tuple[Support, ...], axes: Sequence[Array]) -> None:

@@ -23,8 +23,8 @@ from impact_posture.system.arrays import Array
 
 # An eigenvalue of B_tt below this share of the trace of B is regarded as zero.
 _RANK = 1e-9
-# Number of Newton steps for 1/‖w‖ = 1/μ, which converge from below.  In a test with 10⁵ random B of condition up to
-# 10⁶, one B needed ten steps, and all others fewer.
+# Number of Newton steps for the equation 1/‖w‖ = 1/μ.  The steps converge from below.  In a test with 10⁵ random B of
+# condition up to 10⁶, one B needed ten steps, and all others fewer.
 _STEPS = 10
 # The numeric iteration ends after this many steps, or at a step of this relative size.
 _MOST_STEPS, _ROUNDING = 60, 1e-15
@@ -42,9 +42,9 @@ class CoulombImpact:
         impulse: Impulse of the surface on the robot, world, shape (3,).
         slip: Velocity of the contact point after the impact, world axes, shape (3,); zero if the point sticks.
         sigma: Multiplier ``σ``, 1/kg; zero if the point sticks, infinite if there is no friction.
-        mass: Effective mass ``m = nᵀp`` along the normal with friction, kg: the normal impulse per approach speed.
-            Without friction, ``m = 1/G``.  A spring along the normal is compressed as by this mass, because the
-            direction of the impulse is constant.
+        mass: Effective mass with friction, ``m = nᵀp``, kg: the normal impulse per approach speed.  Without friction,
+            ``m = 1/G``.  A frictionless impact of this mass compresses a spring along the normal equally, because the
+            impulse has a constant direction.
     """
 
     sticks: bool

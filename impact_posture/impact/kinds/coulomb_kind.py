@@ -76,7 +76,7 @@ class CoulombKind(ImpactKind):
         return value, k.size_gradient(x, impact_at(case, r))
 
     def unknowns(self, tree: Tree, n: ca.SX, label: str = "") -> UnknownJump:
-        """Return the unknown velocity jump ``a`` under the impulse ``λ(n − μd)``, with the slip velocity ``κd``.
+        """Return unknowns and equations for the velocity jump ``a`` that the impulse ``λ(n − μd)`` causes.
 
         The last unknowns are the normal impulse ``λ``, the slip direction ``d`` (``‖d‖ ≤ 1``, and 1 if the
         contact slides), the slip speed ``κ``, and ``o = 1 − ‖d‖²``.  The equations are ``M a − J_sᵀf − λJᵀ(n − μd)

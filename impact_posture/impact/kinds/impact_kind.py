@@ -82,7 +82,7 @@ class ImpactKind(ABC):
 
     @abstractmethod
     def unknowns(self, tree: Tree, n: ca.SX, label: str = "") -> UnknownJump:
-        """Return the unknown velocity jump of an impact along ``n`` at ``tree.q``, with its equations."""
+        """Return unknowns and equations for the velocity jump at ``tree.q`` that an impact along ``n`` causes."""
 
     @abstractmethod
     def jump(self, q: Array) -> tuple[Array, Array]:
@@ -170,7 +170,7 @@ class QuadraticKind(ImpactKind):
         return self.factor * form
 
     def lift_direction(self, tree: Tree, n: ca.SX, label: str) -> UnknownJump:
-        """Return the unknown velocity jump for an impact along ``n``, in the axes ``normal_frame`` of the contact."""
+        """Return unknowns and equations for the jump of an impact along ``n``, given in the axes ``normal_frame``."""
         return self.unknowns(tree, n, label)
 
     def lift_entry(self, world: ca.SX, first: UnknownJump, second: UnknownJump) -> ca.SX:

@@ -16,7 +16,7 @@ from impact_posture.impact.impact_contact import point_on
 from impact_posture.impact.metric import Metric
 from impact_posture.system.arrays import Array
 
-# Initial distance of the unknown t of :func:`worst_of` above its lower bounds, for each attempt, in units of the
+# For each attempt: initial distance of the unknown t of :func:`worst_of` from its lower bounds, in units of the
 # scale.  The interior-point method needs a start that satisfies the inequalities strictly.
 ABOVE = (0.01, 1.0, 0.1)
 
@@ -163,7 +163,7 @@ class PlacedJump(NamedTuple):
 
 
 def unknown_jump(case: ImpactCase, tree: Tree, impact: Wrench, label: str = "") -> UnknownJump:
-    """Return the unknowns and equations of the velocity jump that the impulse ``impact`` causes at ``tree.q``."""
+    """Return unknowns and equations for the velocity jump at ``tree.q`` that the impulse ``impact`` causes."""
     a = ca.SX.sym(f"a{label}", tree.nv)
     velocities = tree.velocities(a)
     feet = [Foot(point_on(case.robot, s.frame, s.offset), s.rows) for s in case.supports]

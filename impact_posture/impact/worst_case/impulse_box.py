@@ -46,10 +46,10 @@ class WorstImpulses:
     """The corner of the box of impulses at which the velocity jump is largest.
 
     Attributes:
-        value: Value of the objective: ``λᵀKλ`` at the corner.
-        impulses: Impulse λ of each contact at the corner, N·s, shape (m,).
+        value: Value of the objective, ``λᵀKλ``, in this corner of the box.
+        impulses: Impulse λ of each contact in this corner of the box, N·s, shape (m,).
         tied: All corners that attain ``value``, as rows, N·s, shape (k, m); the first row is ``impulses``.
-        jump: Velocity jump ``Δν`` at the corner, shape (nv,).
+        jump: Velocity jump ``Δν`` in this corner of the box, shape (nv,).
     """
 
     value: float
@@ -73,7 +73,8 @@ def check_contacts(contacts: Sequence[ImpactContact], kind: type[ImpactKind], *,
     Raises:
         ContactError: There are too many contacts, two contacts have the same point and normal, or a single contact is
             bilateral.
-        MetricError: There are several contacts, and the objective is per approach speed or has a cone of normals.
+        MetricError: There are several contacts, and the objective type is not ``impulse`` or there is a cone of
+            normals.
     """
     if len(contacts) == 1:
         if bilateral:
@@ -132,7 +133,7 @@ class ImpulseBox:
         return np.asarray(corners(len(bounds), self.bilateral) * bounds)
 
     def worst(self, q: Array) -> WorstImpulses:
-        """Return the worst corner at ``q``, computed with Pinocchio."""
+        """Return the worst corner of the box for the posture ``q``, computed with Pinocchio."""
         jumps, values = self._jumps_and_values(q)
         tied = finite_maximum(values)[0]
         impulses = self.corners[tied[0]]

@@ -77,7 +77,7 @@ class ModelSet:
 
 
 def finite_maximum(values: Array, within: float = 0.0) -> tuple[NDArray[np.int_], Array]:
-    """Return the indices of values near the largest value, and how far below the largest value they are.
+    """Return the indices of values near the maximum, and how far each of these values is below the maximum.
 
     A value is included if it is at most ``within``, or the fraction :data:`ACTIVE`, below the largest value.  The
     index of the largest value comes first.

@@ -12,8 +12,8 @@ and ``s = sin α``, the program is::
     min t,   t = a + sτ,   Z = [τ − ρ, −bᵀ; −b, (st + ρc²) I − sC] = L²,   ρ ≥ 0
 
 ``Z`` equals ``D(tI − P − μ(n₀n₀ᵀ − c²I))D`` with ``D = diag(s^-½, s^½, s^½)`` and ``μ = ρ/s``.  The entries of
-``Z`` stay bounded as α tends to zero.  At mirror-symmetric postures, two eigenvalues of ``Z`` are zero.  At these
-postures the gradient of ``det Z`` vanishes, but the gradient of the equations with the symmetric root ``L`` does not.
+``Z`` stay bounded as α tends to zero.  At mirror-symmetric postures, two eigenvalues of ``Z`` are zero.  There the
+gradient of ``det Z`` vanishes, but the gradient of ``Z = L²`` with a symmetric ``L`` does not.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ import numpy as np
 
 from impact_posture.system.arrays import Array
 
-# Two values are treated as equal if they differ by less than this fraction of |A| sin α, the range in the cone.
+# Two values of the form are treated as equal if they differ by less than this fraction of |A| sin α.
 TIED = 1e-6
 # Two worst normals are treated as the same if their distance is below this fraction of sin α.
 _APART = 1e-2
