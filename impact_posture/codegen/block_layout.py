@@ -95,8 +95,8 @@ def lay_out(graph: Graph, functions: Sequence[Sequence[str]], block: int = _BLOC
 def _slots(graph: Graph, blocks: Sequence[Block], last: Mapping[int, int]) -> tuple[dict[int, int], dict[int, int]]:
     """Return indices in the work arrays for values that later blocks use, and the lengths of the arrays.
 
-    All functions call blocks in the same order.  Therefore an index can store another value after the ``last`` block
-    that uses the first value.
+    All functions call blocks in the same order.  After the ``last`` block that uses a value, its index can therefore
+    store another value.
     """
     slots: dict[int, int] = {}
     sizes: dict[int, int] = {}

@@ -44,8 +44,8 @@ _ORACLE_TOLERANCE = 1e-5
 _SAMPLES = 20
 # Largest number of libraries in the cache; if there are more, the oldest are deleted.
 _CACHED = 16
-# Gradient → value.  The error of the gradient is relative to its largest entry, or to _SHARE times the value if
-# larger.
+# Name of a gradient → name of its value.  The error of a gradient is relative to its largest entry, or to ``_SHARE``
+# times the value if this is larger.
 _LEAST = {"grad": "H", "objective_grad": "objective"}
 _SHARE = 1e-3
 

@@ -110,8 +110,8 @@ class ExportLibrary:
 def export_library(exported: Sequence[NamedObjective]) -> ExportLibrary:
     """Return the expressions of the objectives of one robot.
 
-    Two results have no expression, because the C code computes ``V`` from ``H`` and ``G``, and an ``objective`` that
-    is a multiple of ``H`` from ``H``.
+    ``V``, and an ``objective`` that is a multiple of ``H``, have no expression, because the C code computes both from
+    ``H`` and ``G``.
     """
     model = exported[0].objective.robot.model
     q, n, limbs = ca.SX.sym("q", model.nq), ca.SX.sym("n", 3), RepeatedLimbs(model)

@@ -63,7 +63,7 @@ class ImpactGradient:
         block = (block.get("free") if free else None) or block
         symbols = dict(block["symbols"])
         if manifest.get("several") and not free:
-            # The objective is for all contacts together, so it is the same for every frame.
+            # This objective is the worst case over all contacts, so it is the same for every frame.
             symbols |= manifest["several"]["symbols"]
         self._library, self._reference = library, block["self_test"]
         real = _TYPES[manifest["real"]]

@@ -59,7 +59,8 @@ class CompiledController:
         tasks = len(manifest.tasks)
         memory = memoryview(self._context)
         targets = np.frombuffer(memory, dtype=float, count=TARGET * tasks).reshape(tasks, TARGET)
-        # In memory, the level follows the targets.  C arrays cannot be empty, so there is at least one target.
+        # In memory, the activation level comes after the targets.  C arrays cannot be empty, so there is at least one
+        # target.
         self._level = np.frombuffer(memory, dtype=float, count=1, offset=8 * TARGET * max(1, tasks))
         self.targets = {task.name: row for task, row in zip(manifest.tasks, targets, strict=True)}
         self._q, self._v, self._force = np.zeros(manifest.nq), np.zeros(manifest.nv), np.zeros(6)
@@ -257,8 +258,8 @@ class CompiledController:
 
         Args:
             t: Time of the switch, s, measured like the times of ticks; by default, the time of the next tick.
-            t_impact: Time from ``t`` to the impact, s, before which a reference flow comes to rest; ``None`` if the
-                time is unknown.
+            t_impact: Time from ``t`` to the impact, s; ``None`` if it is unknown.  A reference flow comes to rest
+                before the impact.
 
         Raises:
             InputError: This phase cannot follow the present phase, or ``t`` is before the time of a waiting phase, or

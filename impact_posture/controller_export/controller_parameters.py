@@ -81,7 +81,7 @@ def parameters(s: Structure, period: float) -> Iterator[Field]:
     yield field("contact_weight", "positive", "weight in the cost of each contact that is not hard", weights)
     yield field("force_weight", "positive", "weight of contact forces, 1/N2", formulation.force_weight)
     spare = formulation.spare_weight
-    yield field("spare_weight", "positive", "weight of the choice among redundant rotors, 1/N2", spare)
+    yield field("spare_weight", "positive", "weight of thrusts that produce no wrench, 1/N2", spare)
     for name in ("lower", "upper"):
         yield field(f"control_{name}", "limit", "limits of thrusts, N, and torques, N m", getattr(actuators, name))
     for name in ("lower", "upper"):
@@ -98,14 +98,14 @@ def parameters(s: Structure, period: float) -> Iterator[Field]:
             ("speed", "amount", "largest speed of an entry of q_r, rad/s or m/s"),
             ("acceleration", "amount", "largest acceleration, rad/s2 or m/s2"),
             ("rho", "nonnegative", "weight of the squared distance from the start, 1/rad2"),
-            ("mu", "amount", "lower bound on the curvature that is used, 1/rad2"),
+            ("mu", "amount", "smaller curvatures are raised to this value, 1/rad2"),
             ("epsilon", "amount", "predicted decrease of H/H0 below which the flow rests"),
-            ("duration", "amount", "longest time of motion after a brace, without a path and rest, s"),
+            ("duration", "amount", "longest time of motion after a brace, not counting a path or rest, s"),
             ("joint_margin", "nonnegative", "distance from the joint limits, rad or m"),
             ("com_margin", "nonnegative", "distance of the center of mass from the edges of the support polygon, m"),
             ("tilt", "amount", "largest tilt of the base from the default posture, rad"),
             ("share", "share", "share of the actuators' limits that static controls may use"),
-            ("haste", "share", "share of the remaining limits for acceleration; braking may use (1 + haste)/2"),
+            ("haste", "share", "share of the remaining control range for accelerations; (1 + haste)/2 for braking"),
             ("tracking", "amount", "joint error at which the motion stops and waits, rad or m"),
         ):
             yield field(f"flow_{name}", rule, f"{text}, of the flow", getattr(s.flow.options, name))  # type: ignore[arg-type]

@@ -143,8 +143,8 @@ def render(
 
     The library contains the ``identity`` of the manifest.  C names of the gradient begin with ``metric``; ``None``
     means no gradient.  If ``objective`` is given, the files contain its :func:`objective_code`; otherwise, the caller
-    exports the gradient.  With ``shared``, the last parameter is ``numbers``, in which robots with the same code may
-    differ.
+    exports the gradient.  With ``shared``, the last parameter is ``numbers``; robots with the same code differ only
+    in these numbers.
     """
     points, robot = tuple((p.frame, p.offset, p in s.turning) for p in s.points), s.robot
     code = dynamics_code(robot, points, shared=shared)

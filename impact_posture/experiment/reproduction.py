@@ -103,7 +103,7 @@ def best_of(rows: Sequence[ControllerRow]) -> ControllerRow | None:
 
 
 def controllers_of(scenario: str, everything: bool) -> tuple[str, ...]:
-    """Return the labels of some controllers, with nominal as the first label, or of all with ``everything``."""
+    """Return the labels of the main controllers, or of all if ``everything``; nominal is first."""
     if everything:
         return (*CONTROLLERS, *HELD, *([FREE] if scenario.endswith("-push") else []))
     return tuple(dict.fromkeys(("nominal", "robust", "robust-flow", RECOMMENDED[scenario])))

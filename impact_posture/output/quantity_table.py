@@ -43,9 +43,9 @@ def answer_key(document: dict[str, Any]) -> str:
 def quantity_rows(impact: ResolvedImpact, initial: dict[str, Any], optimal: dict[str, Any]) -> list[QuantityRow]:
     """Return the rows of the table before and after.
 
-    First come what base, joints and contact feel at the stated speed and friction, then the fastest approach, the
-    norm of the jump, the objective, and H to E.  Unknown quantities have no row.  ``initial`` and ``optimal`` are the
-    blocks of ``result.json``.
+    The first rows state the effects on base, joints and contact at the given speed and friction.  The fastest
+    approach, the norm of the jump, the objective, and H to E follow.  Unknown quantities have no row.  ``initial``
+    and ``optimal`` are the blocks of ``result.json``.
     """
     named = quantities(impact.metric)
     kind, per_speed = impact.objective.kind, named[2][1]

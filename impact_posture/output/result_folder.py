@@ -17,7 +17,7 @@ from impact_posture.system.escape import file_name
 from impact_posture.system.output_folder import write_record
 from impact_posture.system.processes import fork_call, fork_map
 
-# Matplotlib and the C export are imported where they are used, because that takes longer than a small problem.
+# Import Matplotlib and the C export only where they are used, because the import takes longer than a small problem.
 if TYPE_CHECKING:
     from impact_posture.codegen.export import Export
     from impact_posture.output.report.report_scene import ReportScene
@@ -58,9 +58,10 @@ def finish_result(
 ) -> Written:
     """Draw the figures of a result, export, build and check its C code, and write ``report.html``.
 
-    The folder holds ``problem.toml`` and the path to the optimum, if a path was searched.  ``meshes`` permits the
-    report to hold the meshes of the user's own URDF.  ``jobs`` processes draw, and another writes the C code, if
-    ``jobs`` is more than one.  ``progress`` is called with the numbers of finished files and of all files.
+    The folder already contains ``problem.toml``, and the path to the optimum if a path was searched.  ``meshes``
+    permits the report to contain the meshes of the user's own URDF.  If ``jobs`` is more than one, ``jobs`` processes
+    draw the figures, and another process writes the C code.  ``progress`` is called with the numbers of finished
+    files and of all files.
     """
     export = partial(_export, folder, prepared, postures) if codegen else partial(Written, folder)
     scene: ReportScene | None = None
@@ -92,7 +93,7 @@ def finish_result(
         # The report shows the figures, so it comes last.
         write_result_report(folder, prepared, view, postures.document, meshes=meshes, scene=scene)
     except Exception as error:
-        # A result is kept without its report.
+        # Keep the result even if its report cannot be written.
         report_error = one_line(f"{type(error).__name__}: {error}")
     if progress:
         progress(count, count)
@@ -112,7 +113,7 @@ def _export(folder: Path, prepared: Prepared, postures: SolvedPostures) -> Writt
     try:
         exported = write()
     except CompilerError as error:
-        # The posture is kept although the compiler failed. The command line reports the error.
+        # Keep the posture even if the compiler failed.  The command line reports the error.
         compiler_error, exported = error.line, write(force=True, check=False)
     # With a separate record, the export can be replaced alone, with the products of its Makefile.
     write_record(code, "export", products(exported.prefix))

@@ -50,8 +50,8 @@ class RobustTerm(StrictTable):
     Attributes:
         gain: K of the term, 1/s².  The curvature of the objective scales the term, so K is a stiffness like ``kp``.
         ramp: Time in which the term is switched on gradually, s.
-        fade: Two distances from a position limit, rad (m).  The term decreases to zero from the larger distance to
-            the smaller one.
+        fade: Two distances from a position limit, rad (m).  The term is full at the larger distance, and falls to
+            zero at the smaller distance.
     """
 
     gain: Positive
@@ -80,7 +80,7 @@ class StanceGains(StrictTable):
 @checked
 @dataclass(frozen=True)
 class Control(StrictTable):
-    """Gains of a scenario, which are the same for all controllers.  ``None`` for a task means that it does not exist.
+    """Gains of a scenario, the same for all controllers.  A task whose gains are ``None`` does not exist.
 
     Attributes:
         posture: Gains of the posture task.

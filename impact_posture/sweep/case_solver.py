@@ -58,9 +58,10 @@ class CaseSolver:
         return repr((self.robot.data_sha256, prepared.impact.q.tolist(), weights, bodies))
 
     def normal_and_speed(self, values: Mapping[str, Any]) -> tuple[Any, float]:
-        """Return normal and speed for ``values`` of the grid axes.  They determine the problem up to its target."""
+        """Return normal and speed for ``values`` of the grid axes; with the target, they determine the problem."""
         settings = self._case.settings
-        # A speed of the grid selects neither the objective nor the constraint on the approach.
+        # A speed of the problem can select the objective and require the approach speed.  A speed of the grid must
+        # not.
         speed = Unstated(values["speed"]) if "speed" in values else settings.speed
         return values.get("normal", settings.normal), speed
 

@@ -71,7 +71,7 @@ class Timer:
 class Walk:
     """Problem and nonlinear program for points of a shard that differ only in the target.
 
-    If a point needs more body pairs, both are extended, and the next points use the extended program.
+    If a point needs more body pairs, problem and program are extended for this and the next points.
     """
 
     def __init__(
@@ -107,7 +107,8 @@ def search(walk: Walk, place: Place, guesses: Sequence[Start], beside: float = 0
     """Solve one point from the optima of its neighbors and from the given posture.
 
     If these starts lead to different optima, random starts are added.  ``beside`` is the smallest violation at
-    infeasible neighbors, or 0 if a neighbor has an optimum.  If it is positive, the point is probably infeasible.
+    infeasible neighbors, or 0 if a neighbor has an optimum.  If ``beside`` is positive, the point is probably
+    infeasible.
     """
     attempt = _Attempt(walk, place, (walk.settings.starts or STARTS) - 1)
     try:
@@ -179,8 +180,8 @@ class _Attempt:
             if self.problem is not problem:
                 self._walk.grow(self.problem)
             elif price == SLACK_PRICE:
-                # The program is complete, but a constraint is still violated: the solver is in a local minimum of the
-                # violation.  Try again with a higher penalty on violations.
+                # The program contains all violated body pairs, but a constraint is still violated: the solver is in a
+                # local minimum of the violation.  Try again with a higher penalty on violations.
                 price = HIGH_PRICE
             else:
                 return None
@@ -256,7 +257,7 @@ class _End(NamedTuple):
 
 
 def _optima(problem: ConstrainedProblem, ends: Sequence[_End]) -> list[_End]:
-    """Return one solver end for each distinct optimum, sorted from the best to the worst."""
+    """Return one run for each distinct optimum, sorted from the best to the worst."""
     by_posture = {id(end.q): end for end in ends}
     return [
         by_posture[id(optimum.q)]

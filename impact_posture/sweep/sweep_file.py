@@ -29,7 +29,8 @@ _NO_AXIS = ("schema", "q", "starts", "seed", "tradeoff", "tradeoff_against", "pa
 _FILES = ("srdf", "config", "weights", "armature", "posture")
 # Maximum number of points of a grid, so that every index is a 64-bit integer.
 _MOST = 10**15
-# Maximum number of combinations of values that need separate programs.  The settings of all of them are in memory.
+# Maximum number of combinations of values that need separate programs.  The settings of all combinations are in
+# memory.
 _MOST_CASES = 10**5
 # Number of neighbors from which a point is warm started, chosen along the fastest axes.
 _NEIGHBORS = 2
@@ -209,7 +210,7 @@ def read_sweep(path: Path) -> Sweep:
             where=where,
             hint="remove these keys",
         )
-    # A speed of the grid must not look like a stated speed, which would select the objective.
+    # Unlike a speed of the problem, a speed of the grid must not select the objective.
     stated = {name: value for name, value in (problem | first).items() if name != "speed" or "speed" not in first}
     cases = []
     for combination in product(*(values[name] for name in outer)):

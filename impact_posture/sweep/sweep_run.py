@@ -64,7 +64,7 @@ def run_sweep(
 
     Raises:
         InputError: pyarrow is not installed, or a setting is invalid for the robot.
-        OutputError: The folder contains something else, or cannot be written.
+        OutputError: The folder contains other files, or cannot be written.
         WorkerDied: A worker process was killed.  Run the sweep again to continue it.
     """
     check_package("pyarrow", "sweep")

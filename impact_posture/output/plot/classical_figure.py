@@ -81,7 +81,7 @@ def kinds_of(view: ResultView) -> list[Kind]:
 
 
 def classical_figure(view: ResultView) -> Figure:
-    """Draw the shadows of ``JJᵀ``, ``(JJᵀ)⁻¹`` and ``Λ_c`` on the coordinate planes: before above, after below.
+    """Draw the shadows of ``JJᵀ``, ``(JJᵀ)⁻¹`` and ``Λ_c`` on the coordinate planes, before and after.
 
     All panels share a scale, but the three ellipsoids have different units.  If ``JJᵀ`` is singular, the force
     ellipsoid is unbounded, and the label of its panel states this.
@@ -112,7 +112,7 @@ def _longest(matrix: Array) -> float:
 
 
 def _unbounded(plane: Plane, kind: Kind, which: int) -> str:
-    """Return a text if the shadow of an ellipsoid on the plane is unbounded; otherwise an empty text."""
+    """Return a note for the panel if the shadow of an ellipsoid on the plane is unbounded, else an empty text."""
     directions = kind.endless[which]
     seen = np.linalg.svd(plane.axes @ directions, compute_uv=False) if directions.shape[1] else np.zeros(0)
     rank = int((seen > 1e-6).sum())

@@ -28,12 +28,12 @@ if TYPE_CHECKING:
 
 NOTES = {
     "distance": "Each point is the best posture found within this distance from the initial posture (joint angles, "
-    "sliding joints and base taken together)",
+    "sliding joints and base in one norm)",
     "force": "Each point is the best posture found with at most this peak force of the impact",
 }
 _LINES = "; lines between points only join them. Hollow: not certified as an optimum."
 _KNEE = (
-    "At the knee, the share of the gain exceeds the share of the {} most. It is marked only if the excess is 1/3 or "
+    "At the knee, the share of the gain exceeds the share of the {} most. The knee is marked if the excess is 1/3 or "
     "more (a parabola reaches 1/4)."
 )
 # An axis is logarithmic if the ratio of the largest to the smallest value exceeds this number.
@@ -199,9 +199,9 @@ def _title(data: TradeOffData) -> str:
     return f"half of the {_EXTRA[data.against]} yields {100 * (y[0] - half) / gain:.0f} % of the gain; no knee"
 
 
-# This number of joints, those that move most, have a color and a name.  Other joints are gray.
+# Number of joints with a color and a name: the joints that move most.  Other joints are gray.
 _NAMED = 8
-# Joints that move less are not drawn, rad or m.
+# Joints that move less than this, rad or m, are not drawn.
 _MOVES = 1e-4
 _SHARES: dict[str, dict[str, Any]] = {
     "velocity": {"color": BLUE, "linestyle": "-"},
@@ -210,7 +210,7 @@ _SHARES: dict[str, dict[str, Any]] = {
 }
 # Names of the base motions, by the first letter of the velocity.
 _MOVED = {"v": "base along ", "w": "base about "}
-_LEAST = "Torques, thrusts and forces on the feet that are not determined are chosen for the least largest share."
+_LEAST = "If torques, thrusts and foot forces are not unique, their largest share of a limit is minimized."
 _NOTES = {
     "scaled": f"One time scale for the whole motion: its fastest instant just meets a limit. {_LEAST}",
     "slowed": f"The limits allow the speed at each place. It is low at corners. {_LEAST}",
@@ -219,7 +219,7 @@ _NOTES = {
 
 
 def motion_figure(view: ResultView) -> Figure:
-    """Draw over time how far each joint has moved, the objective, and each velocity, torque and thrust / limit."""
+    """Draw joint motion, objective, and velocities, torques and thrusts divided by their limits, over time."""
     motion = required(view.motion, "motion", "path", "run optimize again with `path`")
     use = required(motion.use, "motion", "path", "run optimize again with `path`")
     notes = [_NOTES.get(motion.timing, "")]

@@ -36,7 +36,7 @@ _ENDS = "The last stick of a chain ends at the last frame of its link, or at the
 _NORMAL = "n points out of the surface, towards the robot."
 _PUSHED = "n is the direction of the impulse on the robot, which strikes no surface."
 _BEHIND = "If the contact link reaches beyond the contact point, the surface is drawn behind the link."
-_BODY = "The body is the box between the hips, of no true height."
+_BODY = "The box between the hips is the body; its height is not to scale."
 HATCH = "/////"
 # 3-D axes draw areas with a zorder of 3 or more.  This offset draws lines and markers in front of the areas.
 _FRONT = 50.0

@@ -41,12 +41,12 @@ WORST_BEFORE: dict[str, Any] = {"color": VERMILLION, "linestyle": (0, (3, 1.5)),
 WORST_AFTER: dict[str, Any] = {"color": BLUE, "linestyle": "-", "linewidth": 1.1}
 BEFORE_BAR: dict[str, Any] = {"facecolor": "#fbe3d3", "edgecolor": VERMILLION, "hatch": "//////", "linewidth": 0.6}
 AFTER_BAR: dict[str, Any] = {"facecolor": BLUE, "edgecolor": BLUE, "linewidth": 0.6}
-# Windows of runs; their two colors also differ in a gray print.
+# Colors of time windows in figures of runs; the two colors also differ in a gray print.
 SHADES: dict[str, dict[str, Any]] = {
     "dwell": {"facecolor": "#f0f0f0", "edgecolor": "none", "zorder": 0.1},
     "impact": {"facecolor": "#edc3d6", "edgecolor": "none", "zorder": 0.2},
 }
-# The range of commands, and the robot at the start of a run.
+# Colors of the range of commands, and of the robot at the start of a run.
 BAND: dict[str, Any] = {"facecolor": "#dcdcdc", "edgecolor": "none", "zorder": 1.2}
 START: dict[str, Any] = {"color": "#a9a9a9", "linestyle": "-", "linewidth": 1.0, "zorder": 2.0}
 

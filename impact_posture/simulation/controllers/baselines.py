@@ -120,13 +120,13 @@ class WalkerDriver(RobustDriver):
 
 
 class ReleaseDriver(RobustDriver):
-    """Impact-robust term without the nominal stiffness ``K_p``, until ``H`` no longer decreases.
+    """Apply the impact-robust term without the nominal stiffness ``K_p`` until ``H`` no longer decreases.
 
-    Without ``K_p``, the posture moves to the optimum; with ``K_p``, it would come to rest before.  The scale ``λ`` of
-    the term is the larger of the curvatures at the start and at the offline optimum, so that the stiffness of the
-    term hardly exceeds ``K`` between these postures.  If ``H`` decreases by less than the share :attr:`LEAST` within
-    :attr:`PATIENCE` (s), the controller holds the reached posture.  The term must have ``spring="release"`` and an
-    activation that is not live.
+    Without ``K_p``, the robot reaches the optimum; with ``K_p``, it would come to rest before the optimum.  The scale
+    ``λ`` of the term is the larger of the curvatures at the start and at the offline optimum, so that the stiffness
+    of the term hardly exceeds ``K`` between these postures.  If ``H`` decreases by less than the share :attr:`LEAST`
+    within :attr:`PATIENCE` (s), the controller holds the reached posture.  The term must have ``spring="release"``
+    and an activation that is not live.
     """
 
     PATIENCE, LEAST = 0.5, 0.01

@@ -156,7 +156,8 @@ class ControllerFactory:
         return self._optimum(name) if name in _OFFLINE else None
 
     def _optimum(self, name: str) -> OfflinePosture:
-        # With the controller ``path``, the end effector must stay at its start, so the optimum is another one.
+        # With the controller ``path``, the end effector must stay at its start, so its optimum differs from the
+        # optimum of ``posture``.
         kind, at_contact = _KINDS.get(name, "impulse"), name != "path"
         if (kind, at_contact) not in self._offline:
             self._offline[kind, at_contact] = self.offline_of(

@@ -57,7 +57,7 @@ class CommandLimits:
         if speed.shape != (self._count,) or torque.shape != self.effort.shape:
             sizes = f"give {self._count} and {self.effort.size}"
             raise InputError(f"{speed.size} rotor speeds and {torque.size} torques", where="command", hint=sizes)
-        # If the sum of squares is below the bound, every number is finite and every torque is below the bound.
+        # If the sum of squares is below ``RUNAWAY²``, every number is finite and below ``RUNAWAY``.
         with np.errstate(over="ignore"):
             usual = speed.dot(speed) + torque.dot(torque) < RUNAWAY**2
         if not usual and not (np.isfinite(speed).all() and np.isfinite(torque).all()):
@@ -88,8 +88,8 @@ class Push:
 class ActivePushes:
     """Pushes that act on a world.
 
-    ``active`` lists, for each push, the body, the point in its coordinates, the force, and the step after the last
-    one.
+    ``active`` lists, for each push, the body, the point in body coordinates, the force, and the step at which it
+    ends.
     """
 
     def __init__(self, model: Any) -> None:

@@ -13,7 +13,7 @@ from impact_posture.errors import InputError
 @checked
 @dataclass(frozen=True, kw_only=True)
 class ContactLaw(StrictTable):
-    """Spring and damper with which MuJoCo models a contact.  Both are proportional to the mass at the contact.
+    """Spring and damper of a contact in MuJoCo.  Stiffness and damping are proportional to the effective mass.
 
     At distance r (negative during penetration), the contact law demands the acceleration ``r* = −b r' − k r``.
     With ``solref = (T, ζ)``, ``b = 2/(d₁T)`` and ``k = d/(d₁Tζ)²``.  If both numbers of ``solref`` are negative, they

@@ -162,7 +162,8 @@ class World:
         with unwarned():
             self._advance(speed, count)
         state = self._data.qpos, self._data.qvel
-        # If the sum of squares is below the bound, every number is below the bound.  Otherwise, check each number.
+        # If the sum of squares is below ``RUNAWAY²``, every number is below ``RUNAWAY``.  Otherwise, check each
+        # number.
         usual = state[0].dot(state[0]) + state[1].dot(state[1]) < RUNAWAY**2
         if not usual and not all(np.abs(part).max() < RUNAWAY for part in state):
             raise SimulationDiverged(self.time, where=self.robot.name)
