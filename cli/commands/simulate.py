@@ -27,7 +27,9 @@ Controller = Annotated[
         "impact-aware, or the name that an installed package has registered.",
     ),
 ]  # fmt: skip
-RunSeed = Annotated[int, options.option("--seed", RUN, "Seed of the sensor noise.", min=0)]
+RunSeed = Annotated[
+    int, options.option("--seed", RUN, "Seed of the sensor noise and of [spread] in the scenario.", min=0)
+]
 RunMode = Annotated[
     Mode,
     options.option("--mode", RUN, "In the impact: keep the impact-robust term (live), or hold the posture (held)."),

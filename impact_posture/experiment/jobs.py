@@ -19,7 +19,7 @@ from impact_posture.simulation.outcome import gravest, judge, links_behind
 from impact_posture.simulation.prediction import predict
 from impact_posture.simulation.run import Run, run
 from impact_posture.simulation.scenario_file import read_scenario
-from impact_posture.simulation.setup import set_up
+from impact_posture.simulation.seed_variation import set_up_with
 from impact_posture.system.escape import file_name
 
 Document = dict[str, Any]
@@ -38,7 +38,7 @@ class Job:
     Attributes:
         scenario: Name or file of the scenario.
         controller: Name of the controller.
-        seed: Seed of the sensor noise.
+        seed: Seed of the sensor noise and of the changes in ``[spread]`` of the scenario.
         mode: ``live``, or ``held`` to hold the reached posture (:func:`impact_posture.simulation.run.run`).
         free: If true, the impact model ignores the contacts at the feet.
         gain: K of the impact-robust term, 1/s²; ``None`` for the value in the scenario.
@@ -89,14 +89,16 @@ def parse_controller(text: str) -> tuple[str, Mode, bool]:
     return name, "held" if "held" in variants else "live", "free" in variants
 
 
-@lru_cache(maxsize=8)
-def controller_factory(scenario: str, free: bool = False) -> ControllerFactory:
-    """Return the controller factory of a scenario.  Jobs with the same arguments share a cached factory.
+@lru_cache(maxsize=32)
+def controller_factory(scenario: str, free: bool = False, seed: int = 0) -> ControllerFactory:
+    """Return the controller factory of a scenario with the changes of a seed.
+
+    Jobs with the same arguments share a cached factory.
 
     Raises:
         ImpactPostureError: The scenario cannot be read or set up.
     """
-    return ControllerFactory(set_up(read_scenario(scenario)), free)
+    return ControllerFactory(set_up_with(read_scenario(scenario), seed), free)
 
 
 def execute(job: Job, factory: ControllerFactory | None = None) -> tuple[tuple[Run, ...], Document]:
@@ -108,7 +110,7 @@ def execute(job: Job, factory: ControllerFactory | None = None) -> tuple[tuple[R
         ImpactPostureError: The scenario cannot be set up, or :func:`impact_posture.simulation.run.run` fails.
     """
     if factory is None:
-        factory = controller_factory(job.scenario, job.free)
+        factory = controller_factory(job.scenario, job.free, job.seed)
     factory.compile = job.compile
     scenario = factory.setup.scenario
     if job.sign is not None and job.sign not in scenario.signs:

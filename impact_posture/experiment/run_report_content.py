@@ -41,7 +41,7 @@ _MOVES = (
 
 def run_content(folder: Path, document: Document, view: RunView, job: Job) -> Content:
     """Return the texts and the table of the report about one run."""
-    scenario = controller_factory(job.scenario, job.free).setup.scenario
+    scenario = controller_factory(job.scenario, job.free, job.seed).setup.scenario
     options = ["simulate", job.scenario, "--controller", job.controller, "--seed", str(job.seed)]
     options += ["--mode", "held"] * (job.mode == "held") + ["--free"] * job.free
     options += ["--gain", f"{job.gain:g}"] * (job.gain != scenario.control.robust.gain)

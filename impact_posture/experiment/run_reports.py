@@ -65,7 +65,7 @@ def stored_run(job: Job, store: JobStore) -> tuple[Document, Series] | None:
 
 def run_view(job: Job, part: Document, series: Series) -> RunView:
     """Return the data of a run for figures.  If the run did not complete, the label contains its status."""
-    factory = controller_factory(job.scenario, job.free)
+    factory = controller_factory(job.scenario, job.free, job.seed)
     setup, scenario, objective = factory.setup, factory.setup.scenario, factory.objective()
     return RunView(
         scenario=scenario.name,
@@ -211,7 +211,7 @@ def _job(document: Document, scenario: str) -> Job:
 def _runs(document: Document, stem: Path, scenario: str, count: int) -> list[tuple[RunView, WorstCaseObjective]]:
     """Return view and objective of the first ``count`` runs of a document."""
     job, runs = _job(document, scenario), []
-    factory = controller_factory(job.scenario, job.free)
+    factory = controller_factory(job.scenario, job.free, job.seed)
     if document["model_sha256"] != factory.setup.robot.model_sha256:
         raise SpecError("contains a run with another robot model", where=str(stem.parent), hint="run it again")
     for part in document["runs"][:count]:

@@ -105,6 +105,22 @@ class Bounds(StrictTable):
 
 
 @checked
+@dataclass(frozen=True)
+class Spread(StrictTable):
+    """Largest random changes of the scenario by a seed (:mod:`impact_posture.simulation.seed_variation`).
+
+    Attributes:
+        joints: Change of each joint at the start, rad or m.
+        speed: Relative change of the speed of the impact, or of the force of the push.
+        friction: Relative change of the friction of surfaces and of a thrown ball.
+    """
+
+    joints: NonNegative = 0.0
+    speed: Share = 0.0
+    friction: Share = 0.0
+
+
+@checked
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ScenarioTable(Scene, RobotSettings):
     """Content of a ``scenario.toml``.
@@ -119,6 +135,7 @@ class ScenarioTable(Scene, RobotSettings):
         throw: Throw of a ball at the robot, or ``None``.
         control: Gains of the controllers.
         bounds: Bounds that a run must not violate.
+        spread: Random changes of the scenario by a seed.
     """
 
     schema: Literal["impact-posture/scenario/1"] = "impact-posture/scenario/1"
@@ -131,6 +148,7 @@ class ScenarioTable(Scene, RobotSettings):
     throw: Throw | None = None
     control: Control
     bounds: Bounds = Bounds()
+    spread: Spread = Spread()
 
     @property
     def laws(self) -> tuple[tuple[str, tuple[float, float]], ...]:

@@ -13,13 +13,10 @@ import pinocchio as pin
 from docs.studies.core import Vector
 from docs.studies.robustness.variations import RANGES, URDF_X, URDF_Z, VARIATIONS
 from impact_posture.errors import Infeasible, InputError
-from impact_posture.posture.constraints.requirements import Requirements
-from impact_posture.posture.formulation.build_problem import build_problem
-from impact_posture.posture.manifold.feasible_start import Projector
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.simulation.controller_gains import Gains, StanceGains
 from impact_posture.simulation.scenario_file import RepeatedContacts, Scenario, SinglePush, read_scenario
-from impact_posture.simulation.scenario_objective import scenario_objective
+from impact_posture.simulation.seed_variation import stand
 from impact_posture.simulation.setup import Setup, set_up
 from impact_posture.simulation.world.world import build_world
 
@@ -29,8 +26,6 @@ COUNT, DWELL, PAUSE = 2, 0.4, 0.6
 PATIENCE = 5.0
 # Factor from a friction coefficient to a pyramid inside the cone with a margin of 10 %, as in the scenario files.
 _TRUST = 0.9 / math.sqrt(2)
-# Least distance of the center of mass of a standing robot from the edges of the support polygon, m.
-_COM_MARGIN = 0.02
 # Size of random changes of the base relative to random changes of the joints.
 _BASE = 0.2
 
@@ -158,14 +153,9 @@ def _start(setup: Setup, chosen: Draw) -> Vector:
     """Change the posture of the scenario randomly, and project the result so that the feet keep their places."""
     robot = setup.robot
     rng = _generator(chosen.scenario, chosen.number, chosen.attempt, chosen.seed, what=1)
-    hold = tuple(j for j in robot.spec.constraints.hold if j not in robot.locked)
-    requirements = Requirements(
-        contact_pose="free", hold=hold, com_over_feet=True, com_margin=_COM_MARGIN, com_asked=False
-    )
-    problem = build_problem(robot, scenario_objective(setup), setup.q, requirements)
     step = chosen.values["stir"] * rng.normal(size=robot.nv)
     step[:6] *= _BASE
-    projected = Projector(problem).project(np.asarray(pin.integrate(robot.model, setup.q, step)))
-    if projected.violation > 1e-8:
-        raise Infeasible({"feet": projected.violation}, where=f"{chosen.scenario} {chosen.number}")
-    return robot.check_posture(projected.q, where=chosen.scenario)
+    q = stand(setup, np.asarray(pin.integrate(robot.model, setup.q, step)))
+    if q is None:
+        raise Infeasible({"feet": chosen.values["stir"]}, where=f"{chosen.scenario} {chosen.number}")
+    return q

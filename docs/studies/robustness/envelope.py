@@ -9,7 +9,7 @@ from docs.studies.core import table
 from docs.studies.robustness.draws import COUNT, DWELL, PAUSE
 from docs.studies.robustness.outcomes import COMPARED, NOMINAL, Record
 from docs.studies.robustness.statistics import change, quantile, summarize, tried
-from docs.studies.robustness.variations import OWN_ARMATURE, OWN_MOUNTING, SHIPPED, VARIATIONS
+from docs.studies.robustness.variations import SHIPPED, VARIATIONS
 from impact_posture.experiment.reproduction import PAPER
 from impact_posture.simulation.controllers.controller_factory import MEANING
 
@@ -25,11 +25,11 @@ _NAMES = {
     "saturation_outside": "more saturation outside", "stops": "on a stop", "rested": "not at rest",
     "completed": "failed",
 }  # fmt: skip
-# For each scenario: its differences from the data of the robot, and the variation that shows the effect of each.
+# For each scenario: choices of our own, and the variation that shows the effect of each.
 _DEVIATIONS = {
-    "aerial-vertical": {"the arm is mounted under the base's center, 8 cm behind its own place": OWN_MOUNTING},
+    "aerial-vertical": {"the pitch axis of the shoulder is below the base's center": "mounted 8 cm ahead"},
     "aerial-lateral": {
-        "the armature of the arm is three times the robot's own": OWN_ARMATURE,
+        "the pitch axis of the shoulder is below the base's center": "mounted 8 cm ahead",
         "it approaches at 0.3 m/s, because the rotors hardly push sideways": "speed × 1.67 (as vertical)",
     },
 }
@@ -53,7 +53,7 @@ def page(records: Records) -> Iterator[str]:
     yield from ("", "### One thing at a time", "", *_explained(), "")
     for name, own in records.items():
         yield from (f"`{name}`:", "", *_variations(own), "")
-    yield from ("### What the scenarios changed of the robots", "", *_deviations(records))
+    yield from ("### What our own choices change", "", *_deviations(records))
 
 
 def percent(value: float) -> str:
@@ -161,7 +161,7 @@ def _cells(record: Record, others: Sequence[str]) -> Iterator[str]:
 
 
 def _deviations(records: Records) -> Iterator[str]:
-    """List the values of a scenario that differ from the data of the robot, and their effects."""
+    """List our own choices in a scenario, and their effects."""
     for name, deviations in _DEVIATIONS.items():
         known = {r.draw.name: r for r in records.get(name, ()) if r.draw.name}
         for words, variation in deviations.items():
@@ -177,7 +177,4 @@ def _deviations(records: Records) -> Iterator[str]:
             )
             paper = percent(-PAPER[name].reduction)
             yield f"- `{name}`: {words}. Motion with {variation}: {effects} (the paper: {paper})."
-    yield (
-        "- `solo8-push` and `talos-push` do not change the robots. In all four scenarios, gains and "
-        "sensors are choices."
-    )
+    yield ("- No scenario changes the data of its robot. In all four scenarios, gains and sensors are choices.")

@@ -71,7 +71,7 @@ RANGES: dict[str, tuple[Range, ...]] = {
         ),
         *_TOOL,
         Range("speed", 0.2, 0.45, "speed of approach, m/s"),
-        Range("x", 0.0, 0.13, "distance of the shoulder's pitch axis ahead of the base's center, m"),
+        Range("x", -0.04, 0.10, "distance of the shoulder's pitch axis ahead of the base's center, m"),
         Range("z", -0.10, 0.0, "height of the shoulder over the base's center, m"),
         _SLIP,
         *_COMMON,
@@ -81,9 +81,10 @@ RANGES: dict[str, tuple[Range, ...]] = {
     "talos-push": _pushed(0.15),
 }
 # Position of the shoulder's pitch axis in the URDF, m.
-URDF_X, URDF_Z = 0.08, -0.06
+URDF_X, URDF_Z = 0.0, -0.06
 
-SHIPPED, OWN_MOUNTING, OWN_ARMATURE = "as shipped", "the robot's own mounting", "the robot's own armature (÷ 3)"
+SHIPPED = "as shipped"
+_AHEAD = {"mounted 8 cm ahead": {"x": 0.08}}
 _GAIN = {"K × 0.5": {"gain": 0.5}, "K × 2": {"gain": 2.0}}
 _ARMATURE = {"armature ÷ 3": {"armature": 1 / 3}, "armature × 3": {"armature": 3.0}}
 _CONTACT = {"surface ÷ 4 as stiff": {"contact": 0.25}, "surface × 4 as stiff": {"contact": 4.0}}
@@ -111,7 +112,7 @@ VARIATIONS: dict[str, dict[str, dict[str, float]]] = {
         "elbow 0.5": {"elbow": 0.5},
         "elbow 1.3": {"elbow": 1.3},
         **_ARMATURE,
-        OWN_MOUNTING: {"x": URDF_X},
+        **_AHEAD,
         "speed × 0.5": {"speed": 0.25},
         "speed × 1.5": {"speed": 0.75},
         "elbow 0.7": {"elbow": 0.7},
@@ -126,8 +127,8 @@ VARIATIONS: dict[str, dict[str, dict[str, float]]] = {
         **_GAIN,
         "shoulder −0.75": {"shoulder": -0.75},
         "shoulder −1.4": {"shoulder": -1.4},
-        OWN_ARMATURE: {"armature": 1 / 3},
-        "armature × 3": {"armature": 3.0},
+        **_ARMATURE,
+        **_AHEAD,
         "speed × 0.5": {"speed": 0.15},
         "speed × 1.5": {"speed": 0.45},
         "speed × 1.67 (as vertical)": {"speed": 0.5},

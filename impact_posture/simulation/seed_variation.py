@@ -1,0 +1,92 @@
+"""Changes of a scenario by its seed: the start posture, the speed or force of the impact, and the friction.
+
+Seed 0 is the scenario as its file states it.  Every controller gets the same changes for the same seed.
+"""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.errors import Infeasible
+from impact_posture.posture.constraints.requirements import Requirements
+from impact_posture.posture.formulation.build_problem import build_problem
+from impact_posture.posture.manifold.feasible_start import Projector
+from impact_posture.simulation.scenario_file import RepeatedContacts, Scenario, SinglePush
+from impact_posture.simulation.scenario_objective import scenario_objective
+from impact_posture.simulation.setup import Setup, set_up
+from impact_posture.simulation.world.world import build_world
+from impact_posture.system.arrays import Array
+
+# Least distance of the center of mass of a standing robot from the edges of the support polygon, m.
+_COM_MARGIN = 0.02
+# Random changes of a standing base, divided by the changes of the joints.
+_BASE = 0.2
+# Number of draws of a start whose feet can keep their places, and largest error of the feet, m.
+_DRAWS, _FEET = 20, 1e-8
+
+
+def set_up_with(scenario: Scenario, seed: int) -> Setup:
+    """Set up a scenario with the changes of a seed (``[spread]`` in the scenario file).
+
+    Raises:
+        ImpactPostureError: As :func:`~impact_posture.simulation.setup.set_up`.
+        Infeasible: The feet of a standing robot cannot keep their places at any drawn start.
+    """
+    spread = scenario.spread
+    if seed == 0 or not (spread.joints or spread.speed or spread.friction):
+        return set_up(scenario)
+    generator = np.random.default_rng([seed, zlib.crc32(scenario.name.encode())])
+    speed, friction = 1 + np.array([spread.speed, spread.friction]) * generator.uniform(-1, 1, 2)
+    setup = set_up(_scaled(scenario, float(speed), float(friction)))
+    if not spread.joints:
+        return setup
+    q = _start(setup, spread.joints, generator)
+    return Setup(setup.scenario, setup.robot, q, build_world(setup.robot, setup.scenario, q, setup.scenario.throw))
+
+
+def _scaled(scenario: Scenario, speed: float, friction: float) -> Scenario:
+    """Return the scenario with its speed or force, and its friction, multiplied by a factor."""
+    surfaces = tuple(replace(s, friction=friction * s.friction) for s in scenario.surfaces)
+    scenario, task = replace(scenario, surfaces=surfaces), scenario.task
+    if isinstance(task, RepeatedContacts):
+        return replace(scenario, contacts=replace(task, speed=speed * task.speed))
+    if isinstance(task, SinglePush):
+        x, y, z = (speed * value for value in task.force)
+        return replace(scenario, push=replace(task, force=(x, y, z)))
+    return replace(scenario, throw=replace(task, speed=speed * task.speed, friction=friction * task.friction))
+
+
+def _start(setup: Setup, size: float, generator: np.random.Generator) -> Array:
+    """Return a random start near ``setup.q``.  The base of a flying robot stays, and the feet of a standing robot."""
+    robot, model = setup.robot, setup.robot.model
+    held = [robot.tangent_names.index(j) for j in robot.spec.constraints.hold if j in robot.tangent_names]
+    for _ in range(_DRAWS):
+        step = size * generator.uniform(-1, 1, robot.nv)
+        step[held] = 0.0
+        step[: 6 if robot.floating else 0] *= 0.0 if setup.scenario.control.footing is None else _BASE
+        q = np.clip(pin.integrate(model, setup.q, step), model.lowerPositionLimit, model.upperPositionLimit)
+        if setup.scenario.control.footing is None:
+            return robot.check_posture(q, where=setup.scenario.source)
+        start = stand(setup, q)
+        if start is not None:
+            return start
+    raise Infeasible({"feet": size}, where=f"{setup.scenario.source}, spread.joints")
+
+
+def stand(setup: Setup, q: Array) -> Array | None:
+    """Return the posture nearest to ``q`` whose feet are at their places; ``None`` if there is none.
+
+    The center of mass stays above the support polygon.
+    """
+    robot = setup.robot
+    hold = tuple(j for j in robot.spec.constraints.hold if j not in robot.locked)
+    requirements = Requirements(
+        contact_pose="free", hold=hold, com_over_feet=True, com_margin=_COM_MARGIN, com_asked=False
+    )
+    problem = build_problem(robot, scenario_objective(setup), setup.q, requirements)
+    projected = Projector(problem).project(q)
+    return None if projected.violation > _FEET else robot.check_posture(projected.q, where=setup.scenario.source)
