@@ -32,7 +32,9 @@ Processes = Annotated[int, option("--jobs", RUN, "Number of processes that run a
 
 def rows_table(page: Page, rows: tuple[ControllerRow, ...] | list[ControllerRow]) -> None:
     """Write a table with one row per controller of a scenario."""
+    from impact_posture.experiment.jobs import jsonable
     from impact_posture.experiment.reproduction_summary import interval_text, percent
+    from impact_posture.experiment.seed_statistics import headline
 
     lines = []
     for row in rows:
@@ -48,6 +50,11 @@ def rows_table(page: Page, rows: tuple[ControllerRow, ...] | list[ControllerRow]
     page.table(head, lines, right=(1, 2, 3, 4))
     page.line("  q_total: motion in the impact windows (rad, m); peak jump in rad/s and m/s", style="dim")
     page.line("  less %: reduction of q_total; in 1 s %: from each impact until 1 s later", style="dim")
+    nominal, *others = jsonable(rows)
+    if nominal["controller"] == "nominal":
+        for row in others:
+            if row["reduction"] is not None:
+                page.line(f"  {headline(row, nominal)}")
     if any(row.failed for row in rows):
         page.line("  no reduction if a run of either controller did not complete; means are over completed runs",
                   style="dim")  # fmt: skip

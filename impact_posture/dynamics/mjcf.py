@@ -79,6 +79,14 @@ class Mjcf:
             name=name, type=type_, size=size, mass=0.0, contype=0, conaffinity=0, **pose(placement)
         )
 
+    def add_hull(self, joint: int, name: str, points: Array) -> None:
+        """Add the convex hull of points in the frame of a joint, shape (k, 3), as in :meth:`add_geom`."""
+        convex = import_mujoco().mjtMeshInertia.mjMESH_INERTIA_CONVEX
+        self.spec.add_mesh(name=name, uservert=np.ravel(points), inertia=convex)
+        self.body(joint).add_geom(
+            name=name, type=import_mujoco().mjtGeom.mjGEOM_MESH, meshname=name, mass=0.0, contype=0, conaffinity=0
+        )
+
     def add_plane(self, name: str, point: Array, normal: Array) -> None:
         """Add an infinite plane to the world through ``point`` with unit ``normal``, in world axes, shape (3,)."""
         upright = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), np.array(normal)).matrix()

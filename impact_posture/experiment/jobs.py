@@ -15,7 +15,7 @@ from impact_posture.posture.analysis.result_document import versions
 from impact_posture.posture.program.compiled_solver import CompileMode
 from impact_posture.simulation.controllers.controller_factory import ControllerFactory, Mode
 from impact_posture.simulation.metrics import Metrics, measure
-from impact_posture.simulation.outcome import gravest, judge, links_behind
+from impact_posture.simulation.outcome import doubts, gravest, judge, links_behind
 from impact_posture.simulation.prediction import predict
 from impact_posture.simulation.run import Run, run
 from impact_posture.simulation.scenario_file import read_scenario
@@ -121,6 +121,10 @@ def execute(job: Job, factory: ControllerFactory | None = None) -> tuple[tuple[R
     status = gravest(part["status"] for part in parts)
     completed = status == "completed"
     offline = factory.offline(job.controller)
+    prediction = _mean_prediction([p for part in parts for p in part["prediction"]]) if completed else None
+    warnings = [*factory.setup.warnings, *factory.warnings]
+    if prediction is not None:
+        warnings += [*links_behind(factory.setup, runs), *doubts(factory.setup, runs, metrics, prediction["ratio"])]
     document = {
         "schema": SCHEMA,
         "scenario": scenario.name,
@@ -135,15 +139,11 @@ def execute(job: Job, factory: ControllerFactory | None = None) -> tuple[tuple[R
         "events": [{**event, "sign": part["sign"]} for part in parts for event in part["events"]],
         "metrics": combined(metrics).to_dict() if completed else None,
         "windows": [{**window, "sign": part["sign"]} for part in parts for window in part["windows"]],
-        "prediction": _mean_prediction([p for part in parts for p in part["prediction"]]) if completed else None,
+        "prediction": prediction,
         "runs": parts,
         "offline": None if offline is None else offline.to_dict(),
         "path": factory.path.to_dict() if job.controller.removesuffix("-stiff") == "path" else None,
-        "warnings": [
-            *factory.setup.warnings,
-            *factory.warnings,
-            *(links_behind(factory.setup, runs) if completed else ()),
-        ],
+        "warnings": warnings,
         "model_sha256": factory.setup.robot.model_sha256,
         "versions": software(),
     }

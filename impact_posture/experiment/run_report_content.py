@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from impact_posture.experiment.jobs import Document, Job, controller_factory
-from impact_posture.experiment.seed_statistics import FEWEST, Interval, without_noise
+from impact_posture.experiment.seed_statistics import FEWEST, Interval, headline, without_noise
 from impact_posture.output.plot.result_view import number
 from impact_posture.output.plot.run_view import RunView, run_header
 from impact_posture.output.report.report_page import Content, Table
@@ -84,14 +84,11 @@ def comparison_content(folder: Path, document: Document, view: RunView) -> Conte
     table = [("status", *(str(row["status"]) for row in rows), "", "")]
     for key, unit, meaning in table_metrics(view):
         table.append((key, *(_mean(row["metrics"].get(key)) for row in rows), unit, meaning))
-    verdict = []
-    for row in rows:
-        if row["reduction"] is not None and row["controller"] != "nominal":
-            share = row["reduction"]["mean"]
-            verdict.append(f"{row['controller']} moves {abs(share):.0%} {'less' if share > 0 else 'more'}")
-    line = "No reduction is known."
-    if verdict:
-        line = f"Within the impact windows, against nominal: {'; '.join(verdict)}."
+    nominal = next((row for row in rows if row["controller"] == "nominal"), None)
+    compared = [row for row in rows if row["reduction"] is not None and row is not nominal]
+    lines = ["No reduction is known."] if nominal is None or not compared else [
+        "Within the impact windows, against nominal:", *(headline(row, nominal) for row in compared)
+    ]  # fmt: skip
     seeds = len(document["seeds"])
     alike = without_noise(Interval(**interval) for row in rows for interval in row["metrics"].values())
     intervals = ", with 95 % intervals" if seeds >= FEWEST else ""
@@ -102,7 +99,7 @@ def comparison_content(folder: Path, document: Document, view: RunView) -> Conte
         title=f"{document['scenario']}: {', '.join(labels)}",
         command=typed_command(folder) or shlex.join(command),
         facts=tuple(run_header([view])[1]),
-        verdict=(line, *(f"{row['controller']}: {reason}" for row in rows for reason in row["failed"])),
+        verdict=(*lines, *(f"{row['controller']}: {reason}" for row in rows for reason in row["failed"])),
         tables=(Table(means, ("", *labels, "unit", "meaning"), tuple(table)),),
         moves=f"{_MOVES} The runs are those of the first seed.",
         notes=(),

@@ -100,6 +100,21 @@ class ControllerRow:
     force: Interval | None
 
 
+def headline(row: Document, nominal: Document) -> str:
+    """Return one line on a controller: its motion, peak jump and peak force, relative to nominal.
+
+    Both arguments are rows of ``comparison.json``, with a reduction in ``row``.
+    """
+    less = row["reduction"]["mean"]
+    parts = [f"{row['controller']} moves {abs(less):.0%} {'less' if less > 0 else 'more'}"]
+    change = row["change"]["peak_jump"]["mean"] / nominal["metrics"]["peak_jump"]["mean"]
+    costs = [f"peak jump {change:+.0%}"]
+    # The peak force of a push is the push.
+    if abs(row["force"]["mean"] - 1) > _SAME:
+        costs.append(f"peak force × {row['force']['mean']:.2g}")
+    return "; ".join([*parts, ", ".join(costs)])
+
+
 def value_of(document: Document, quantity: str) -> float:
     """Return the value of a metric in the document of a job."""
     metrics = document["metrics"]

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
 import pinocchio as pin
 from scipy import ndimage
+from scipy.spatial.transform import Rotation
 
+from impact_posture.simulation.metrics import Metrics
 from impact_posture.simulation.recorder import feet_of
 from impact_posture.simulation.run import Run
 from impact_posture.simulation.series import Flags, Series
@@ -23,6 +25,8 @@ OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)
 _EVERY = 25
 # A joint origin that is deeper behind a surface, m, has moved through it.  Compression of a contact is less deep.
 _DEEP = 0.02
+# Outside this range of the measured jump divided by the predicted jump, the prediction does not fit.
+_FITS = (0.67, 1.5)
 
 
 @dataclass(frozen=True)
@@ -61,6 +65,50 @@ def links_behind(setup: Setup, runs: Iterable[Run]) -> tuple[str, ...]:
                 "have no shapes that stop them (scenario.toml [[shapes]])"
             )
     return tuple(lines)
+
+
+def doubts(setup: Setup, runs: Iterable[Run], metrics: Iterable[Metrics], ratio: float | None) -> tuple[str, ...]:
+    """Return a warning for each reason to doubt the numbers of completed runs.
+
+    ``ratio`` is the mean of the measured jump divided by the predicted jump.
+    """
+    lines = []
+    if ratio is not None and not _FITS[0] <= ratio <= _FITS[1]:
+        lines.append(f"the measured jump is {ratio:.2g} times the predicted jump: the model does not fit this impact")
+    counts = np.zeros(2, dtype=int)
+    for run in runs:
+        series = run.series
+        for window in run.of("impact"):
+            inside = series.slice(window.begin, window.end)
+            counts += series.relaxed[inside].sum(), series.held[inside].sum()
+    for count, what in zip(counts, ("limits made a task give way", "the last command was repeated"), strict=True):
+        if count:
+            lines.append(f"{what} in {count} ticks of the impact windows")
+    if (seconds := sum(m.saturation_inside for m in metrics)) > 0:
+        lines.append(f"an actuator was at its limit for {seconds:.2g} s of the impact windows")
+    return (*lines, *_rotors_touch(setup, runs))
+
+
+def _rotors_touch(setup: Setup, runs: Iterable[Run]) -> Iterator[str]:
+    """Yield a warning for each surface that the link with the rotors touched."""
+    built = setup.world.built
+    if not len(built.rotor_link):
+        return
+    propulsion = setup.robot.spec.propulsion
+    assert propulsion is not None  # noqa: S101 (the link exists)
+    for name, n in built.normals.items():
+        for run in runs:
+            t = run.series.t[_below(setup, run.series.q, n, built.points[name])]
+            if t.size:
+                yield f"{propulsion.frame} or a rotor on it touched the surface '{name}' at t = {t[0]:.2f} s"
+                break
+
+
+def _below(setup: Setup, q: Array, n: Array, point: Array) -> Flags:
+    """Return in which postures the link with the rotors touches the plane through ``point`` with normal ``n``."""
+    turned = Rotation.from_quat(q[:, 3:7]).inv().apply(n)
+    depth = (turned @ setup.world.built.rotor_link.T).min(axis=1)
+    return np.asarray((q[:, :3] - point) @ n + depth < 0)
 
 
 def _origins(model: pin.Model, joints: Sequence[int], postures: Array) -> Array:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
+from impact_posture.collision.shape_corners import shape_points
+from impact_posture.collision.urdf_shapes import UnusableShape, largest_extent, read_urdf_shapes
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.mjcf import Mjcf, build_mjcf, import_mujoco
 from impact_posture.dynamics.numeric import Numeric
@@ -39,6 +42,8 @@ class BuiltScene:
         points: Point on each surface, world, m, by name.
         gaps: Pair (surface, shape) → distance of the shape from the surface in the start posture, m.
         shape_geoms: Name of the geom of each shape, in the order of the shapes in the scene.
+        rotor_link: Points whose hull contains the link with the rotors, in the frame of its joint, shape (k, 3), m;
+            empty without rotors.
         throw: Throw of the ball; ``None`` if the scene has no ball.
     """
 
@@ -47,6 +52,7 @@ class BuiltScene:
     points: Mapping[str, Array]
     gaps: Mapping[tuple[str, str], float]
     shape_geoms: tuple[str, ...]
+    rotor_link: Array
     throw: Throw | None = None
 
 
@@ -80,17 +86,38 @@ def build_scene(robot: Robot, scene: Scene, q: Array, throw: Throw | None = None
         for name, point in points.items()
         for shape, placement in placed
     }
+    hulls, rotor_link = _add_rotor_link(mjcf, robot)
     for surface in scene.surfaces:
         name = xml_name(f"surface {surface.name}")
         mjcf.add_plane(name, points[surface.name], normals[surface.name])
-        for geom in geoms:
+        for geom in (*geoms, *hulls):
             _add_pair(mjcf, name, geom, surface)
     if throw is not None:
         add_ball(mjcf, throw)
         _add_pair(mjcf, BALL, xml_name(f"shape {throw.frame}"), throw)
     _add_rotors(mjcf, robot)
     _add_motors(mjcf, robot)
-    return BuiltScene(mjcf, normals, points, gaps, tuple(geoms), throw)
+    return BuiltScene(mjcf, normals, points, gaps, tuple(geoms), rotor_link, throw)
+
+
+def _add_rotor_link(mjcf: Mjcf, robot: Robot) -> tuple[list[str], Array]:
+    """Add the hulls of the link that carries the rotors, with their disks.
+
+    Return the names of the geoms, and the points of :attr:`BuiltScene.rotor_link`.  Surfaces are planes, so the hull
+    of a shape touches a surface where the shape does.
+    """
+    propulsion, names, points = robot.spec.propulsion, [], [np.zeros((0, 3))]
+    shapes = [] if propulsion is None else read_urdf_shapes(robot)[0]
+    for shape in (shape for shape in shapes if propulsion is not None and shape.link == propulsion.frame):
+        # The robot warns of shapes that cannot be used.
+        with suppress(UnusableShape):
+            corners = shape_points(shape.load(largest_extent(robot)).mesh)
+            link = robot.model.frames[robot.frame_id(shape.link)]
+            placement = link.placement * shape.placement
+            names.append(xml_name(f"rotor link {shape.name}"))
+            points.append(corners @ placement.rotation.T + placement.translation)
+            mjcf.add_hull(link.parentJoint, names[-1], points[-1])
+    return names, np.vstack(points)
 
 
 def _add_pair(mjcf: Mjcf, first: str, second: str, law: ContactLaw) -> None:
