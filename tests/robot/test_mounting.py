@@ -93,23 +93,22 @@ def test_the_floating_base_itself_is_not_mounted() -> None:
     assert "\n" not in caught.value.line
 
 
-def mounted_scenario(folder: Path, mounting: str) -> Path:
-    """Write aerial-vertical with a mounting."""
-    text = Path(read_scenario("aerial-vertical").source).read_text(encoding="utf-8")
-    path = folder / "mounted.toml"
-    path.write_text(text.replace('robot = "tilthex_arm"', f'robot = "tilthex_arm"\n{mounting}'), encoding="utf-8")
-    return path
-
-
 def test_the_mounting_of_a_scenario_reaches_the_robot(tmp_path: Path) -> None:
-    scenario = read_scenario(mounted_scenario(tmp_path, "mounting = { shoulder_roll = [0.08, 0.0, 0.0] }"))
-    assert scenario.mounting == {"shoulder_roll": (0.08, 0.0, 0.0)}
+    scenario = read_scenario("aerial-vertical")
+    assert scenario.mounting == {"shoulder_roll": (-0.08, 0.0, 0.0)}
+    text = Path(scenario.source).read_text(encoding="utf-8")
+    without = tmp_path / "plain.toml"
+    lines = [line for line in text.splitlines() if not line.startswith("mounting")]
+    without.write_text("\n".join(lines), encoding="utf-8")
+    assert dict(read_scenario(without).mounting) == {}
     mounted, plain = (load_robot(scenario.robot, each) for each in (scenario, replace(scenario, mounting={})))
     assert mounted.model_sha256 != plain.model_sha256
 
 
 def test_a_mounting_of_two_numbers_in_a_scenario_is_refused(tmp_path: Path) -> None:
-    path = mounted_scenario(tmp_path, "mounting = { shoulder_roll = [0.08, 0.0] }")
+    text = Path(read_scenario("aerial-vertical").source).read_text(encoding="utf-8")
+    path = tmp_path / "short.toml"
+    path.write_text(text.replace("[-0.08, 0.0, 0.0]", "[-0.08, 0.0]"), encoding="utf-8")
     with pytest.raises(ImpactPostureError, match=r"mounting.shoulder_roll") as caught:
         read_scenario(path)
     assert "\n" not in caught.value.line

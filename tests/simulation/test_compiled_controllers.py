@@ -64,10 +64,11 @@ def test_a_run_in_c_agrees_with_python(name: str, controller: str, mode: Any) ->
 
 def test_robots_that_differ_in_armature_and_mounting_share_the_library() -> None:
     scenario = read_scenario("aerial-vertical")
+    x, y, z = scenario.mounting["shoulder_roll"]
     other = replace(
         scenario,
         armature={"shoulder_pitch": 0.01, "elbow_pitch": 0.02},
-        mounting={"shoulder_roll": (0.01, 0.0, 0.02)},
+        mounting={"shoulder_roll": (x + 0.01, y, z + 0.02)},
     )
     factories = [in_c("aerial-vertical"), ControllerFactory(set_up(other), compile="always", gradient_of=interpreted)]
     folders: list[set[Path]] = []

@@ -27,9 +27,11 @@ _NAMES = {
 }  # fmt: skip
 # For each scenario: choices of our own, and the variation that shows the effect of each.
 _DEVIATIONS = {
-    "aerial-vertical": {"the pitch axis of the shoulder is below the base's center": "mounted 8 cm ahead"},
+    "aerial-vertical": {
+        "the arm is mounted below the base's center, 8 cm behind its place in the URDF": "mounted as in the URDF"
+    },
     "aerial-lateral": {
-        "the pitch axis of the shoulder is below the base's center": "mounted 8 cm ahead",
+        "the arm is mounted below the base's center, 8 cm behind its place in the URDF": "mounted as in the URDF",
         "it approaches at 0.3 m/s, because the rotors hardly push sideways": "speed × 1.67 (as vertical)",
     },
 }
@@ -177,4 +179,7 @@ def _deviations(records: Records) -> Iterator[str]:
             )
             paper = percent(-PAPER[name].reduction)
             yield f"- `{name}`: {words}. Motion with {variation}: {effects} (the paper: {paper})."
-    yield ("- No scenario changes the data of its robot. In all four scenarios, gains and sensors are choices.")
+    yield (
+        "- `solo8-push` and `talos-push` do not change the robots. In all four scenarios, gains and "
+        "sensors are choices."
+    )

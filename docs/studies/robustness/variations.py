@@ -81,10 +81,10 @@ RANGES: dict[str, tuple[Range, ...]] = {
     "talos-push": _pushed(0.15),
 }
 # Position of the shoulder's pitch axis in the URDF, m.
-URDF_X, URDF_Z = 0.0, -0.06
+URDF_X, URDF_Z = 0.08, -0.06
 
 SHIPPED = "as shipped"
-_AHEAD = {"mounted 8 cm ahead": {"x": 0.08}}
+_URDF = {"mounted as in the URDF": {"x": URDF_X}}
 _GAIN = {"K × 0.5": {"gain": 0.5}, "K × 2": {"gain": 2.0}}
 _ARMATURE = {"armature ÷ 3": {"armature": 1 / 3}, "armature × 3": {"armature": 3.0}}
 _CONTACT = {"surface ÷ 4 as stiff": {"contact": 0.25}, "surface × 4 as stiff": {"contact": 4.0}}
@@ -112,7 +112,7 @@ VARIATIONS: dict[str, dict[str, dict[str, float]]] = {
         "elbow 0.5": {"elbow": 0.5},
         "elbow 1.3": {"elbow": 1.3},
         **_ARMATURE,
-        **_AHEAD,
+        **_URDF,
         "speed × 0.5": {"speed": 0.25},
         "speed × 1.5": {"speed": 0.75},
         "elbow 0.7": {"elbow": 0.7},
@@ -128,7 +128,7 @@ VARIATIONS: dict[str, dict[str, dict[str, float]]] = {
         "shoulder −0.75": {"shoulder": -0.75},
         "shoulder −1.4": {"shoulder": -1.4},
         **_ARMATURE,
-        **_AHEAD,
+        **_URDF,
         "speed × 0.5": {"speed": 0.15},
         "speed × 1.5": {"speed": 0.45},
         "speed × 1.67 (as vertical)": {"speed": 0.5},
