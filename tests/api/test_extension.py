@@ -168,9 +168,10 @@ def test_the_installed_command_runs_a_registered_controller(setback: ModuleType,
 
     words = ("simulate", scenario, "--json", "--controller")
     done = start(*words, "setback", "--no-report", cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (0, "")
+    assert done.returncode == 0
     document = json.loads(done.stdout)
-    assert (document["controller"], document["status"], document["warnings"]) == ("setback", "completed", [])
+    assert (document["controller"], document["status"]) == ("setback", "completed")
+    assert all("of the impact windows" in warning for warning in document["warnings"])
     for name, said in (
         ("setbakc", ("no controller 'setbakc'", "did you mean setback?")),
         ("gone", ("controller 'gone' (setback_gone:make)", "No module named 'setback_gone'")),

@@ -71,7 +71,8 @@ def test_simulate_without_a_compiler(aerial: Path, tmp_path: Path) -> None:
     bare = {"PATH": str(tmp_path), "CC": "", "IMPACT_POSTURE_CACHE": str(tmp_path / "cache")}
     done = start(*command, "bare", cwd=tmp_path, env=bare)
     assert done.returncode == 0
-    (line,) = done.stderr.splitlines()
+    line, *others = done.stderr.splitlines()
+    assert all("of the impact windows" in other for other in others)
     assert line.startswith("warning: the gradient is interpreted, not compiled, which is slower: ")
     assert "no C compiler found" in line
     assert start(*command, "quiet", "--quiet", cwd=tmp_path, env=bare).stderr == ""
@@ -79,7 +80,7 @@ def test_simulate_without_a_compiler(aerial: Path, tmp_path: Path) -> None:
     totals = []
     for folder, warnings in (("bare", 1), ("quiet", 1), ("whole", 0)):
         result = json.loads((tmp_path / folder / "run.json").read_text())
-        assert len(result["warnings"]) == warnings
+        assert len([w for w in result["warnings"] if "of the impact windows" not in w]) == warnings
         totals.append(result["metrics"]["q_total_impact"])
     assert totals[0] == totals[1] == pytest.approx(totals[2], rel=1e-3)
 

@@ -144,7 +144,8 @@ def test_auto_falls_back_with_one_warning(
     assert not solution.compiled
     said = [line for line in result_document(prepared, solution)["warnings"] if "not compiled" in line]  # type: ignore[attr-defined]
     assert len(said) == 1 and words in said[0]
-    assert not (cache.is_dir() and list(cache.iterdir()))
+    # The hulls of links are cached too, but no part of a library remains.
+    assert not (cache.is_dir() and [path for path in cache.iterdir() if path.name != "silhouettes"])
     with pytest.raises(error, match=words):
         build_nlp(prepared.problem, compile="always")
 

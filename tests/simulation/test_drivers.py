@@ -102,7 +102,9 @@ def test_all_controllers_share_gains_tasks_and_weights(monkeypatch: pytest.Monke
         factory = shared_factory(name)
         # Formulations do not depend on the offline optimum or the path, so both are replaced.
         monkeypatch.setitem(vars(factory), "_optimum", lambda name, q=factory.setup.q: SimpleNamespace(q=q))
-        monkeypatch.setitem(vars(factory), "path", SimpleNamespace(duration=0.0))
+        still = {"q": np.tile(factory.setup.q, (2, 1)), "v": np.zeros((2, factory.setup.robot.nv))}
+        path = SimpleNamespace(duration=0.0, t=np.array([0.0, 1.0]), a=still["v"], **still)
+        monkeypatch.setitem(vars(factory), "path", path)
         nominal = factory.driver("nominal").controller.formulation
         for controller in CONTROLLERS:
             formulation = factory.driver(controller).controller.formulation

@@ -10,9 +10,10 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from impact_posture.dynamics.mjcf import import_mujoco
 from impact_posture.errors import SpecError
 from impact_posture.simulation.metrics import measure
-from impact_posture.simulation.outcome import Event, judge, links_behind
+from impact_posture.simulation.outcome import Event, doubts, judge, links_behind
 from impact_posture.simulation.recorder import STATUSES
 from impact_posture.simulation.run import Run
 from impact_posture.simulation.scenario_file import Bounds, read_scenario
@@ -209,3 +210,31 @@ def test_a_robot_that_would_fall_is_refused(
     with pytest.raises(SpecError, match=words) as caught:
         set_up(read_scenario(path))
     assert "\n" not in caught.value.line and str(path) in caught.value.line
+
+
+def test_rotors_that_touch_a_surface_and_limits_in_a_window_are_warnings() -> None:
+    """A wall 5 cm before the rotors: the arm is held back, so the base runs into the wall."""
+    setup = set_up(read_scenario("aerial-lateral"))
+    run_ = driven(controller_factory(shortened("aerial-lateral", settle=0.2)), "nominal")
+    assert not [line for line in doubts(setup, [run_], [measure(setup, run_)], 1.0) if "touched" in line]
+    forward = replace(run_.series, q=run_.series.q + 0.4 * np.eye(setup.robot.nq)[0])
+    moved = replace(run_, series=forward)
+    (line,) = (line for line in doubts(setup, [moved], [measure(setup, moved)], 1.0) if "touched" in line)
+    assert line.startswith("base_link or a rotor on it touched the surface 'wall' at t = ")
+    (fit,) = (line for line in doubts(setup, [run_], [measure(setup, run_)], 1.6) if "predicted" in line)
+    assert fit.startswith("the measured jump is 1.6 times the predicted jump")
+    assert not [line for line in doubts(setup, [run_], [measure(setup, run_)], 1.4) if "predicted" in line]
+
+
+def test_the_wall_stops_the_rotors() -> None:
+    """Contact pairs of the rotor link: none at the start, some if the base is moved into the wall."""
+    setup = set_up(read_scenario("aerial-lateral"))
+    mujoco, model = import_mujoco(), setup.world.built.mjcf.compile()
+    data, layout = mujoco.MjData(model), setup.world.built.mjcf.layout
+    for shift, touches in ((0.0, False), (0.4, True)):
+        q = setup.q.copy()
+        q[0] += shift
+        data.qpos[:] = layout.qpos(q)
+        mujoco.mj_forward(model, data)
+        names = {model.geom(contact.geom1).name + model.geom(contact.geom2).name for contact in data.contact}
+        assert any("rotor link" in name for name in names) is touches

@@ -24,7 +24,7 @@ Band = tuple[float, float]
     ("name", "settle", "changes", "nominal", "reduction", "lowered"),
     [
         ("aerial-vertical", 2.0, {}, (0.22, 0.37), (0.65, 0.85), (0.95, 0.99)),
-        ("aerial-lateral", 1.5, {}, (0.08, 0.16), (0.70, 0.90), (0.60, 0.78)),
+        ("aerial-lateral", 1.5, {}, (0.08, 0.16), (0.42, 0.58), (0.60, 0.98)),
         ("solo8-push", 1.5, {"patience": 2.0, "duration": 0.4}, (0.38, 0.44), (0.09, 0.16), (0.015, 0.03)),
         ("talos-push", 4.0, {"patience": 1.0, "duration": 0.4}, (0.26, 0.31), (0.42, 0.62), (0.70, 0.85)),
     ],
