@@ -90,7 +90,7 @@ def read_toml(path: Path) -> dict[str, object]:
     """Read a TOML file.
 
     Raises:
-        SpecError: There is no such file, it cannot be read, or it is not valid TOML.
+        SpecError: The file is absent, cannot be read, or is not valid TOML.
     """
     try:
         return tomllib.loads(read_text(path))

@@ -154,7 +154,7 @@ class Robot:
         """Return the index of a frame.  If a link and a joint have the same name, return the link.
 
         Raises:
-            FrameNotFound: There is no such frame.
+            FrameNotFound: The robot lacks this frame.
         """
         if name not in self._frames:
             raise FrameNotFound(name, self.frame_names, where=self.name)
@@ -173,7 +173,7 @@ class Robot:
         """Return the index of the joint ``name`` in the model.
 
         Raises:
-            JointNotFound: There is no such joint.
+            JointNotFound: The robot lacks this joint.
             JointLocked: The joint is locked.
         """
         if name in self.locked:
@@ -193,7 +193,7 @@ class Robot:
         """Return a copy of the named posture, or of the default posture, shape (nq,).
 
         Raises:
-            PostureNotFound: There is no such posture.
+            PostureNotFound: The robot lacks this posture.
         """
         name = name or self.default_posture
         if name not in self.postures:

@@ -163,7 +163,7 @@ def locate(robot: str, options: LoadOptions) -> Located:
 
 
 def srdf_path(spec: RobotSpec, options: LoadOptions, base: Path) -> Path | None:
-    """Return the SRDF of a robot, or ``None``; raise ``UrdfError`` if there is no such file."""
+    """Return the SRDF of a robot, or ``None``; raise ``UrdfError`` if the file is absent."""
     text = options.srdf or spec.model.srdf
     if text is None:
         return None

@@ -71,7 +71,7 @@ def doubts(setup: Setup, runs: Iterable[Run], metrics: Iterable[Metrics], ratio:
     """Return a warning for each reason to doubt the numbers of completed runs.
 
     ``ratio`` is the mean of the measured jump divided by the predicted jump.  The prediction for a push neglects the
-    controller, which works during the whole push, so its ratio is no reason.
+    controller, which works during the whole push, so its ratio gives no warning.
     """
     lines = []
     if setup.scenario.push is None and ratio is not None and not _FITS[0] <= ratio <= _FITS[1]:

@@ -89,7 +89,7 @@ class Report:
         active: Pairs of the name of an active bound and ``lower`` or ``upper``.
         dynamics: Error of the equations of motion, ``‖Mν̇ + h − Gu − Jᵀf − J_eᵀF̂‖_∞``.
         level: Activation of a posture task that prepares for impacts, 0 to 1.
-        objective: Value of the posture task's objective, for example ``H``; NaN if there is no such task.
+        objective: Value of the posture task's objective, for example ``H``; NaN without such a task.
         iterations: Iterations of the QP solver.
     """
 
