@@ -1,4 +1,4 @@
-"""The posture with the least peak force, and the error for a bound on the force below it."""
+"""The posture with the least peak force, and the error message if the bound on the peak force is lower."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def least_effective_mass(
     compile: CompileMode = "auto",
     guesses: Sequence[Array] = (),
 ) -> PostureSolution:
-    """Minimize the effective mass with friction of the leading contact under the constraints of a problem.
+    """Minimize the effective mass, with friction, at the leading contact under the constraints of a problem.
 
     For every contact stiffness, the posture with the least effective mass has the least peak force.  Arguments and
     errors are as in :func:`~impact_posture.posture.search.multistart.solve`.
@@ -37,7 +37,7 @@ def least_effective_mass(
 def explain_force_bound(
     error: Infeasible, prepared: Prepared, *, starts: int, seed: int, jobs: int, compile: CompileMode
 ) -> None:
-    """Put the least peak force under the other constraints into the error of an infeasible problem.
+    """Add the least peak force that the other constraints allow to the error of an infeasible problem.
 
     Leave the error as it is if the problem has no bound on the force, has model variants, or is infeasible without
     this bound.

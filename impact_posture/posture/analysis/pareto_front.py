@@ -49,7 +49,7 @@ _RISE = 1e-6
 # Maximum number of other optima from which a path starts, and maximum number of rounds that start from results of
 # neighboring bounds.
 _PATHS, _ROUNDS = 3, 3
-# Maximum number of times that missing parts are added to the program for one point.
+# Maximum number of times that missing rows are added to the program for one point.
 _GROWTH = 8
 # Number of starts of the search for the posture with the least force.
 _FORCE_STARTS = 8

@@ -54,7 +54,7 @@ def _surface_warnings(prepared: Prepared, initial: Array, q: Array, posture: str
 
 
 def _behind(prepared: Prepared, q: Array) -> list[str]:
-    """Return what lies behind the contact plane, except what moves with the contact link."""
+    """Return the links or joints behind the contact plane, except those that move rigidly with the contact link."""
     oracle, around = prepared.impact.objective.oracle.at(q), prepared.problem.surroundings
     contact, n = oracle.numeric.placement(oracle.point).translation, oracle.n.copy()
     depth = around.depth(prepared.impact.contact) if around else 0.0
@@ -82,7 +82,7 @@ def _ground_warnings(prepared: Prepared, q: Array, posture: str) -> list[str]:
 
 
 def _origins(prepared: Prepared, numeric: Numeric) -> list[tuple[int, str, Array]]:
-    """Return joint index, name and world origin of all that no collision constraint keeps apart at a posture.
+    """Return joint index, name and world origin of the links or joints that no collision constraint keeps apart.
 
     These are the links without shapes, or all joints if no link has a shape or there are no collision constraints.
     """

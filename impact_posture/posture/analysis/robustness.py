@@ -77,13 +77,13 @@ class Robustness:
 
     @property
     def price(self) -> float | None:
-        """Relative increase of the nominal model's objective compared with its own optimum."""
+        """Relative increase of the nominal model's objective from the nominal optimum to the robust optimum."""
         own = self.model_variants[0].own
         return None if own is None else self.model_variants[0].at_robust / own - 1
 
     @property
     def gain(self) -> float | None:
-        """Relative decrease of the worst objective compared with the optimum of the nominal model."""
+        """Relative decrease of the worst objective from the nominal optimum to the robust optimum."""
         return None if self.worst_nominal is None else 1 - self.worst_robust / self.worst_nominal
 
     @property

@@ -1,4 +1,4 @@
-"""The points and the knee of the trade-off of objective against distance from the initial posture or force."""
+"""Points and knee of the trade-off between the objective and the distance from the initial posture, or the force."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ class TradePoint:
         distance: Distance or force of the posture; it is below ``within`` if a larger distance or force does not
             improve the objective.
         q: Posture, shape (nq,).
-        certificate: Certificate of the problem with the bound; at the first point, its stationarity has no meaning.
+        certificate: Optimality certificate of the problem with this bound.  Only one posture satisfies the bound of
+            the first point, so ignore the stationarity there.
         first: Whether this is the first point, the only posture at the least distance or force.
     """
 
@@ -54,7 +55,7 @@ class TradePoint:
 
 @dataclass(frozen=True, eq=False)
 class TradeOff:
-    """The best objective within each distance from the initial posture or, depending on ``against``, peak force.
+    """The best objective under each bound on ``against``: the distance from the initial posture, or the peak force.
 
     ``points`` are the points of the curve, in the order of increasing distance or force.  ``knee`` is the index of
     the point at the knee (:func:`find_knee`); ``None`` if there is no knee.  ``solves`` is the number of times that

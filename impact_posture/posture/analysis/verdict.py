@@ -1,4 +1,4 @@
-"""The verdict on an optimal posture: what base, joints and contact feel at the given speed and friction."""
+"""The verdict on an optimal posture: changes at base, joints and contact for the given speed and friction."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Verdict:
         outcome: Verdict in a few words: ``better`` (nothing that base, joints or contact feel grows by 5 % or more),
             ``better for … at the price of …``, ``no better``, ``worse``, ``cannot arrive`` or ``unknown``.
         line: The conditions, the outcome and the numbers in words.
-        minimized: What was minimized, and the change of the norm of the jump, in words.
+        minimized: Name of the minimized objective, and change of the norm of the jump, in words.
         jump: Relative change of ``‖Δν‖_W``; ``None`` if it is unknown.
         impulse: Relative change of the normal impulse.
         peak_force: Relative change of the peak force with friction; ``None`` if it is unknown.

@@ -1,4 +1,4 @@
-"""What the optimal posture changes for base, joints and contact, and the outcome that follows from it."""
+"""Changes at base, joints and contact from the initial to the optimal posture, and the outcome that follows."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ class PredictedImpact:
 
 @dataclass(frozen=True)
 class Change:
-    """Change of one quantity that base, joints or contact feel.
+    """Change of one quantity of the impact: a velocity jump, an impulse or a force.
 
     Attributes:
-        side: Part that feels it.
+        side: Part to which the quantity belongs.
         relative: Relative change.
         line: The change in words.
-        felt: Whether the change is not negligible beside the approach speed.
+        felt: Whether the change is not negligible compared with the approach speed.
     """
 
     side: Side
@@ -137,9 +137,9 @@ def in_words(change: float) -> str:
 
 
 def outcome_of(parts: tuple[Change, ...]) -> str:
-    """Return the outcome: ``better`` if something falls and nothing grows, else for whom and at which price."""
+    """Return the outcome: ``better`` if something falls and nothing grows, or a text on what falls and grows."""
     grow, fall = _sides([part for part in parts if part.grows]), _sides([part for part in parts if part.falls])
-    # Of base and joints, a part that both falls and grows pays a price.
+    # If one quantity of a side falls and another grows, the side counts only as growing.
     fall = [side for side in fall if side not in grow]
     if not grow:
         return "better" if fall else "no better"

@@ -10,8 +10,8 @@ from impact_posture.config.json_block import json_block
 from impact_posture.impact.evaluation.evaluation import Evaluation
 from impact_posture.impact.resolved_impact import ResolvedImpact
 
-# If the attainable speed is below the approach speed by less than this share, the posture can arrive, because the
-# verdict shows only three digits of both speeds.
+# If the attainable speed is below the approach speed by less than this share, it is treated as sufficient, because
+# the verdict shows only three digits of both speeds.
 _REACHED = 5e-3
 # A distance (rad, m) up to this value is a rounding error.
 _STILL = 1e-6
@@ -40,7 +40,7 @@ class Condition:
 
 @dataclass(frozen=True)
 class Circumstances:
-    """What is known of an optimization beyond the impact in its two postures.
+    """Data of an optimization other than the impacts in the initial and the optimal posture.
 
     Attributes:
         attainable: Highest speed at which the joints can bring the contact to the surface in the optimal posture,

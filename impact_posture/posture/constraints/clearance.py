@@ -28,7 +28,7 @@ _ROWS = 1e-3
 _MISSING = 5e-9
 # Maximum number of pairs that one posture adds to the program, the pairs with the deepest penetration first.  The
 # first number is for pairs of links, the second for pairs of a link and a plane.  Links behind a plane are mostly
-# neighbors, so moving the deepest one out also moves the others.
+# neighbors, so moving the deepest link out also moves the other links.
 _MOST, _MOST_BEHIND = 6, 2
 
 _Lifted = WeakKeyDictionary[Tree, dict[int, tuple[Corners, LiftedRows]]]

@@ -29,8 +29,8 @@ from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.posture.constraints.constraint import Constraint, LiftedRows, Linearization, digest
 from impact_posture.system.arrays import Array
 
-# At a posture where the contact point begins to slip, the values for sticking and sliding differ by less than this
-# share, and the certificate uses the gradients of both.
+# If the values for sticking and for sliding differ by less than this share, the contact point is about to slip.  The
+# certificate then uses the gradients for both cases.
 _KINK = 1e-6
 
 
@@ -80,7 +80,7 @@ class ImpactBounds(Constraint):
 
     @property
     def unknowns(self) -> int:
-        # Without friction, the impulse is one unknown; with friction, size, direction and two complementary ones.
+        # Without friction, the impulse adds one unknown.  With friction, it adds the six unknowns of CoulombKind.
         return self._motion + (6 if self._slips else 1)
 
     @property

@@ -1,4 +1,4 @@
-"""Data class for what a task requires of the posture; the constraints are built from these requirements."""
+"""The requirements of a task on the posture, from which the constraints are built."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class Requirements:
     """Requirements of the task on the posture.
 
     Attributes:
-        contact_pose: What is constrained in the pose of the first contact frame; same values as the setting
+        contact_pose: Constrained part of the pose of the first contact frame; same values as the setting
             ``contact_pose``.
         other_poses: As ``contact_pose``, for each further contact frame.
         target_position: Target position of the contact frame, world axes, m; ``None`` for its initial position.

@@ -138,7 +138,7 @@ def requirements(settings: ProblemSettings, objective: Objective) -> Requirement
 
 
 def _approaches(settings: ProblemSettings, objective: Objective) -> bool:
-    """Return whether the joints must reach the speed: as stated, else for a stated speed of a robot that stands."""
+    """Return whether the joints must reach the speed; by default, if the user gives a speed and the robot stands."""
     if settings.approach is not None:
         return settings.approach
     flies = objective.robot.floating and not objective.supports and settings.base != "fixed"

@@ -24,8 +24,8 @@ from impact_posture.posture.program.constrained_problem import (
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array, independent_rows, null_space
 
-# Angle of a trial turn (rad), and the fraction of this angle that must remain after the projection of a possible
-# turn.
+# Angle of a trial turn, rad.  The constraints allow the turn if at least this fraction of the angle remains after the
+# projection onto the constraints.
 _TRIAL, _SURVIVES = 0.05, 0.1
 # Number of random feasible postures at which ranks are compared.
 _SAMPLES = 4

@@ -1,4 +1,4 @@
-"""Forces that hold a robot at rest and minimize the largest share of its limit that an actuator uses."""
+"""Forces that hold a robot at rest, and for which the largest share that an actuator uses of its range is least."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ class Equilibrium:
         self._latest: tuple[bytes, Distribution] | None = None
 
     def _affine(self, load: Array, by_force: Array) -> tuple[Array, Array, Array, Array]:
-        """Return ``A, b, S, c`` of the balance ``A z + b`` and the shares ``S z + c`` from the load at ``z = 0``."""
+        """Return ``A, b, S, c`` for the balance ``A z + b`` and the shares ``S z + c``; ``load`` is for ``z = 0``."""
         slopes, values = self.rows @ by_force, self.rows @ load + self.offset
         half = (self.load.upper - self.load.lower)[self._free] / 2
         middle = (self.load.upper + self.load.lower)[self._free] / 2
@@ -118,7 +118,7 @@ class Equilibrium:
         return A, b, np.vstack([torques, thrusts]), np.append(c, -middle / half)
 
     def spares(self, q: Array, room: float) -> bool:
-        """Return whether nearly even forces balance the base with no share above ``1 − room``.
+        """Return whether nearly even forces balance the base, and all shares are then at most ``1 − room``.
 
         Nearly even forces are thrusts in the middle of their ranges and equal foot forces, both corrected to balance
         the base.  If they suffice, no linear program is needed.  If not, other forces may still hold the posture.
@@ -149,7 +149,7 @@ class Equilibrium:
         return float(np.abs(S @ z + c).max(initial=0.0)) if balanced else np.inf
 
     def distribute(self, q: Array) -> Distribution:
-        """Return the forces that minimize the largest share, or the imbalance if they cannot balance the base."""
+        """Return the forces that minimize the largest share, or the imbalance if no forces balance the base."""
         key = q.tobytes()
         if self._latest is None or self._latest[0] != key:
             self._latest = key, self._distribute(q)

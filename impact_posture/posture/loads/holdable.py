@@ -23,7 +23,7 @@ from impact_posture.system.arrays import Array
 
 # Rows are added to the program if a posture violates them by more than this, half the tolerance of the certificate.
 _KEPT = 5e-9
-# If the share of its limit that an actuator uses is within this of 1, the row may be active and have a multiplier.
+# If an actuator share differs from 1 by less than this value, its row may be active and have a multiplier.
 _NEAR = 1e-3
 # Weight of a violated actuator limit in the search for conflicts (:attr:`Constraint.price`).  It is lower than the
 # weight of a position error, so the search reports the actuators and not the pose.
@@ -135,11 +135,11 @@ class Holdable(Constraint):
 
 
 class ReachableWrench(ExpressionConstraint):
-    """The rotors can produce the wrench on the base: ``R h(q) = 0`` for all combinations they cannot produce.
+    """The rotors can produce the wrench ``h(q)`` on the base: ``R h(q) = 0``.
 
     For example, parallel rotors produce no side force, so the robot has to be level to hold its weight.  ``rows`` is
-    the matrix ``R``, which acts on the base wrench in units of the robot's weight, shape (6 − rank of the allocation,
-    6).
+    the matrix ``R``, shape (6 − rank of the allocation, 6).  Each row is a combination of the base wrench that the
+    rotors cannot produce, in units of the robot's weight.
     """
 
     price = _PRICE

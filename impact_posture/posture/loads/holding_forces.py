@@ -9,8 +9,8 @@ import numpy as np
 from impact_posture.posture.loads.equilibrium import Equilibrium
 from impact_posture.system.arrays import Array
 
-# A share above 1 by up to this value is treated as a rounding error of the solver, as is an unbalanced wrench of up
-# to this value in units of the robot's weight.
+# Rounding errors of the solver: a share may exceed 1 by this value, and an unbalanced wrench may reach this value in
+# units of the robot's weight.
 _ROUNDING = 1e-6
 
 

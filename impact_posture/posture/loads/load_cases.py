@@ -124,7 +124,7 @@ def load_cases(objective: Objective, q: Array, requirements: Requirements) -> Lo
 
 
 def _reach(load: StaticLoad, q: Array) -> tuple[Array, int]:
-    """Return orthonormal combinations of the base wrench as rows, the reachable ones first, and the rank r."""
+    """Return orthonormal combinations of the base wrench as rows, the r reachable combinations first, and r."""
     vectors, values, _ = np.linalg.svd(load.torque(q, np.zeros(load.count)).by_force[:6])
     return vectors.T, int((values > _RANK * values.max(initial=0.0)).sum())
 

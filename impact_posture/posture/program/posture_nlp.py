@@ -34,7 +34,7 @@ class WarmStart:
         x: All unknowns, shape (n,), between ``lower`` and ``upper``.
         of_bounds: Multipliers of the bounds ``lower`` and ``upper``, shape (n,).
         of_rows: Multipliers of the rows, shape (m,).
-        scale: Divisor of the objective to which the multipliers belong.
+        scale: Divisor of the objective in this run; the multipliers are for the divided objective.
     """
 
     program: int
@@ -94,7 +94,7 @@ class PostureNLP:
         return self.program.chart
 
     def at(self, problem: ConstrainedProblem) -> PostureNLP:
-        """Return the program for a problem with another target, which has the same expressions and row bounds."""
+        """Return the program for a problem with another target but the same expressions and row bounds."""
         nlp = self.bounded(problem)
         vars(nlp)["_row_bounds"] = self._row_bounds
         return nlp
@@ -200,8 +200,8 @@ def build_nlp(
 ) -> PostureNLP:
     """Build the program for ``starts`` runs; this number decides whether compiling saves time.
 
-    ``program`` has the expressions of the same problem with fewer rows, which are reused.  ``rows`` are the rows of
-    the constraints, if they are already built.
+    ``program`` is a program of the same problem with fewer rows; its expressions are reused.  ``rows`` are the rows
+    of the constraints, if they are already built.
 
     Raises:
         CompilerError, OutputError: For the same reasons as in
