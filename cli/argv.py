@@ -18,7 +18,7 @@ def put_right(arguments: Sequence[str]) -> list[str]:
     """Return the arguments with two changes.
 
     ``--payload FRAME MASS`` becomes ``--payload FRAME:MASS``, because a repeatable option of Typer cannot have two
-    values.  An option in ``_OPTIONAL`` without a value gets its default value, because Typer requires a value.
+    values.  If an option in ``_OPTIONAL`` has no value, the default value is added, because Typer requires a value.
     """
     words, rest = [], list(arguments)
     while rest:

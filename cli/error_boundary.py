@@ -82,7 +82,7 @@ class _Fault:
 def _explain(error: Exception, arguments: Sequence[str]) -> _Fault:
     kind = type(error).__name__
     if isinstance(error, ImpactPostureError):
-        # If the error names a parameter, and its option is on the command line, name the option instead.
+        # If the error names a parameter whose option is on the command line, name the option instead.
         option = f"--{error.where.partition(' ')[0].replace('_', '-')}"
         typed = any(word.partition("=")[0] == option for word in arguments)
         where = option + error.where[len(option) - 2 :] if typed else error.where

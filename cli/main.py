@@ -8,7 +8,7 @@ from impact_posture_cli.process import finish, memory_fault, prepare, refuse
 
 
 def main() -> None:
-    """Run the command line and exit with its code."""
+    """Run the command line and exit with the exit code of the command."""
     prepare()
     if fault := memory_fault():
         sys.exit(refuse(fault))

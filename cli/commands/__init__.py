@@ -16,12 +16,12 @@ COMMANDS: Final[dict[str, str]] = {
     "plot": "Draw a result again: ellipsoids, postures, jumps, the null-space path.",
     "report": "Write report.html of an output folder again: an offline page with the robot in 3-D.",
     "view": "Open report.html of an output folder in the browser.",
-    "codegen": "Write the metric and its gradient as C code for a controller.",
+    "codegen": "Write the metric and the gradient of the metric as C code for a controller.",
     "verify": "Compute H, G, Λ_c and ∇H with several methods and compare the results: pass or fail.",
     "simulate": "Run a controller through an experiment in MuJoCo; write metrics, time series and figures.",
     "compare": "Run several controllers through an experiment with several seeds: means with 95 % intervals.",
     "reproduce": (
-        "Run the paper's experiments and compare the results with its table. An interrupted run can be continued."
+        "Run the paper's experiments and compare the results with the paper. An interrupted run can be continued."
     ),
     "sweep": "Solve a grid of problems on one or many machines; 'sweep show DIR' draws maps of the results.",
 }

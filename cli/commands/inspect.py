@@ -142,7 +142,7 @@ def _frames(page: Page, summary: dict[str, Any]) -> None:
     for frame in links:
         by_joint.setdefault(frame["joint"], []).append(frame["name"])
     page.gap()
-    page.title(f"Link frames ({len(links)})", "by the joint that moves them; frames of 'universe' never move")
+    page.title(f"Link frames ({len(links)})", "listed by the joint that moves them; frames of 'universe' never move")
     page.table(("moved by", "frames"), [(joint, ", ".join(names)) for joint, names in by_joint.items()])
     if not page.quiet:
         page.line("  joints' own frames have the joints' names; --json lists every frame", style="dim")

@@ -34,8 +34,9 @@ class Body(NamedTuple):
 def merged_bodies(shapes: Sequence[pin.GeometryObject], apart: NDArray[np.bool_]) -> list[Body]:
     """Merge shapes of a robot into bodies, so that fewer pairs of bodies must be checked for collisions.
 
-    Two bodies are merged if they have the same joint, must stay apart from the same shapes, and no point of their
-    common hull is more than 1 cm from both.  ``apart``, shape (n, n), tells whether two shapes must not touch.
+    Two bodies are merged if they have the same joint, must stay apart from the same shapes, and every point of their
+    common hull is within 1 cm of one of the bodies.  ``apart``, shape (n, n), tells whether two shapes must not
+    touch.
     """
     corners = [
         hull_corners(shape_points(shape.geometry) @ shape.placement.rotation.T + shape.placement.translation)
@@ -55,7 +56,7 @@ def merged_bodies(shapes: Sequence[pin.GeometryObject], apart: NDArray[np.bool_]
 
 
 def _fill(a: Body, b: Body) -> bool:
-    """Return whether no point of the common hull of two bodies is farther than ``_FILL`` from both."""
+    """Return whether every point of the common hull of two bodies is within ``_FILL`` of one of the bodies."""
     parts = (*a.corners, *b.corners)
     points, part = np.vstack(parts), np.repeat(np.arange(len(parts)), [len(corners) for corners in parts])
     hull = SweptHull("", "", 0, points, 0.0)

@@ -112,7 +112,7 @@ class _Source:
 
 @dataclass(frozen=True)
 class _LoadedShapes:
-    """Links whose shapes can be used, and warnings of loading them, as the cache stores them."""
+    """Content of a cache file: links whose shapes can be used, and warnings from loading these shapes."""
 
     links: tuple[str, ...]
     warnings: tuple[str, ...]

@@ -54,7 +54,7 @@ class UrdfShapes(NamedTuple):
 
 
 class UnusableShape(Exception):
-    """A shape cannot be used; the text states the reason and what to do."""
+    """A shape cannot be used; the message contains the reason and a hint."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class UrdfShape:
         placement: Placement in the axes of the link.
         kind: Tag of the URDF, such as ``box`` or ``mesh``.
         sizes: Sizes in the order of the URDF, m, or the scale of a mesh.
-        color: Red, green, blue and opacity, 0 to 1, if the URDF states them.
+        color: Red, green, blue and opacity, 0 to 1; ``None`` if the URDF contains no color.
     """
 
     name: str

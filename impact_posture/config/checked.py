@@ -56,7 +56,7 @@ def checked(target: _Target) -> _Target:
 
 
 class _Named:
-    """Base of stand-ins for classes imported under ``TYPE_CHECKING``.  A value matches by the name of its class."""
+    """Base of stand-ins for classes imported under ``TYPE_CHECKING``; values match by class name."""
 
 
 class _Names(dict[str, Any]):

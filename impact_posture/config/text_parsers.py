@@ -72,7 +72,7 @@ def parse_payloads(texts: Sequence[str]) -> tuple[tuple[str, float], ...]:
 
 
 def parse_number_or_name(text: str) -> float | str:
-    """Return the number that a text states, or the text itself if it is not a number."""
+    """Convert a text to a number; if this is impossible, return the text unchanged."""
     try:
         return float(text)
     except ValueError:

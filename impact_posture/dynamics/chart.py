@@ -34,8 +34,8 @@ class JointSlot:
 class Chart:
     """Chart ``x`` of the configuration space: like ``q``, but an angle replaces each pair of cosine and sine.
 
-    A quaternion keeps its four numbers, and :meth:`norms` is the equation of its unit norm.  ``q(x)`` is therefore
-    smooth and has no singularities.
+    A quaternion keeps its four numbers, and :meth:`norms` returns the equation for the unit norm.  ``q(x)`` is
+    therefore smooth and has no singularities.
     """
 
     def __init__(self, model: pin.Model) -> None:

@@ -107,7 +107,7 @@ class JumpDerivatives:
         return ca.tril2symm(below) + ca.diag(self._tree.armature)
 
     def _of_momentum(self, motion: _Motion) -> ca.SX:
-        """Return the derivative of ``M x`` minus the forces of the foot impulses, shape (nv, joints)."""
+        """Return the derivative of ``M x + J_sᵀ(impulses)`` for the arguments of :meth:`_motion`, (nv, joints)."""
         below = _kept(self._momenta.T @ motion.turned, self._lies_on(self._of_v, self._of_u))
         above = _kept(motion.changed.T @ self._subspaces, self._lies_on(self._of_u, self._of_v, itself=False))
         return below + above.T
@@ -210,7 +210,10 @@ def _motion_of_link(R: ca.SX, p: ca.SX, motion: ca.SX) -> ca.SX:
 
 @template
 def _inertia_of_link(R: ca.SX, p: ca.SX, mass: ca.SX, lever: ca.SX, inertia: ca.SX) -> ca.SX:
-    """Return ``[I h; hᵀ m]`` about the origin of the root link, ``h = m c``; ``inertia`` is about ``c``."""
+    """Return ``[I h; hᵀ m]`` with ``h = m c``.
+
+    ``I`` is about the origin of the root link, and ``inertia`` is about the center of mass ``c``.
+    """
     c = p + R @ lever
     h = mass * c
     about_root = symmetric(R @ symmetric(inertia) @ R.T + ca.dot(h, c) * ca.SX.eye(3) - h @ c.T)

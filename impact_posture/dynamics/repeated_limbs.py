@@ -136,7 +136,7 @@ def _alike(model: pin.Model, first: tuple[int, ...], second: tuple[int, ...]) ->
 
 
 def _joints(model: pin.Model, limb: tuple[int, ...]) -> list[tuple[object, ...]]:
-    """Return for each joint of a limb: family, axis, whether the joint is locked, and position of its parent."""
+    """Return for each joint of a limb: family, axis, whether it is locked, and position of the parent joint."""
     kinds, locked = [joint_kind(model.joints[k], str(model.names[k])) for k in limb], finite_armature(model)[1]
     parents = [-1, *[limb.index(int(model.parents[k])) for k in limb[1:]]]
     return [

@@ -31,7 +31,7 @@ class ImpactContact:
         normal: Direction out of the surface, towards the robot, shape (3,).  The argument can have any length; the
             attribute is a unit vector.
         offset: Position of the contact point in the coordinates of ``frame``, shape (3,), m.
-        normal_frame: Axes in which ``normal`` is stated: ``world``, or ``contact`` for axes that turn with the frame.
+        normal_frame: Axes of ``normal``: ``world``, or ``contact`` for axes that turn with the frame.
         impulse: Largest impulse λ̄ along the normal, N·s.
         friction: Coulomb coefficient μ.
 

@@ -186,7 +186,7 @@ class WorstCaseObjective:
     def gradient_fun(self) -> ca.Function:
         """Return the function ``(q, n) → value, gradient`` with a tangent gradient, shape (nv,).
 
-        ``n`` is the normal of the first contact in its ``normal_frame``; with a cone of normals, it is the axis of
+        ``n`` is the normal of the first contact in its ``normal_frame``; with a cone of normals, ``n`` is the axis of
         the cone.  If several normals, impulses or models attain the maximum, the gradient is a subgradient.
         """
         k = self.kernel

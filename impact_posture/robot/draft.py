@@ -178,7 +178,7 @@ def _supports(draft: Draft, robot: Robot, feet: Sequence[Support]) -> None:
         draft.note(text, "[[supports]]", 'frame = "FOOT"', 'kind = "point"')
     for foot in feet:
         draft.lines += ["", "[[supports]]"]
-        draft.key("frame", foot.frame, "a foot by the SRDF, its name or its height", guessed=True)
+        draft.key("frame", foot.frame, "a foot according to the SRDF, its name or its height", guessed=True)
         reason = "a flat collision shape" if any(foot.size) else "one of two feet, on a leg of six joints"
         reason = reason if foot.kind == "surface" else "no flat collision shape"
         draft.key("kind", foot.kind, reason, guessed=True)

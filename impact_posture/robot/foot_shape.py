@@ -85,7 +85,7 @@ def _lowest_points(robot: Robot, data: pin.Data, index: int, urdf: Path) -> Arra
 
 
 def _bottom(shape: Any, at: pin.SE3) -> Sequence[Array]:
-    """Return points of a box, cylinder or ball that include the lowest points."""
+    """Return points of a box, cylinder or ball; the lowest points are among them."""
     match shape:
         case coal.Sphere():
             return [at.translation - [0, 0, shape.radius]]

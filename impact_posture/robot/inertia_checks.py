@@ -18,8 +18,8 @@ _TINY = 1e-10
 _LARGEST = 1e100
 # Relative violation of the triangle inequality that is treated as a rounding error.
 _TRIANGLE_SLACK = 1e-3
-# A mass matrix, scaled to unit diagonal, is singular if its smallest eigenvalue is below this times the largest.  The
-# smallest ratio of the known robots is above 1e-3.
+# A mass matrix, scaled to unit diagonal, is singular if the smallest eigenvalue is below this fraction of the largest
+# eigenvalue.  The smallest ratio of the known robots is above 1e-3.
 _SINGULAR = 1e-12
 
 
@@ -112,7 +112,7 @@ def check_mass_matrix(robot: Robot, where: str) -> None:
     named = [name for name, moves in zip(names, free, strict=True) if moves]
     verb = "moves no inertia" if len(named) == 1 else "move no inertia together"
     fault = f"the mass matrix is singular at posture '{robot.default_posture}': {', '.join(named)} {verb}"
-    hint = "give the links mass and rotational inertia, or the joints `armature`, or `lock` one"
+    hint = "give the links mass and rotational inertia, give the joints `armature`, or `lock` one of these joints"
     raise InertiaError(fault, where=where, hint=hint)
 
 

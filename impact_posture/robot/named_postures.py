@@ -20,8 +20,8 @@ def named_postures(
 ) -> tuple[dict[str, Array], str]:
     """Return all named postures, shape (nq,) each, and the name of the default posture.
 
-    Postures of ``robot.toml`` (``spec``) replace ``group_state`` tags of the SRDF with the same name.  The model must
-    have its final limits.
+    Postures of ``robot.toml`` (``spec``) replace ``group_state`` tags of the SRDF with the same name.  The limits of
+    the model must be final.
 
     Raises:
         UrdfError: The SRDF cannot be read.

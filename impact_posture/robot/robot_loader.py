@@ -103,9 +103,10 @@ def names_a_path(robot: str, folder: Path) -> bool:
 
 
 def from_folder(data: dict[str, object], folder: Path, files: Sequence[str]) -> dict[str, object]:
-    """Return a copy of the content of a file in ``folder`` with its relative paths resolved.
+    """Return a copy of ``data``, the content of a file in ``folder``, with relative paths resolved.
 
-    The content names a ``robot`` as the command line does.  The values of the keys ``files`` may be paths.
+    The key ``robot`` contains a name, a path or a URI, as on the command line.  The values of the keys ``files`` may
+    be paths.
     """
     data = dict(data)
     for key in files:

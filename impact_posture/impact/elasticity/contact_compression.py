@@ -38,7 +38,7 @@ from impact_posture.system.arrays import Array
 HERTZ_TIME = sqrt(pi) * gamma(7 / 5) / gamma(9 / 10)
 # Radius of the steel tip on the robot, m; a contact given by a material assumes this tip.
 TIP_RADIUS = 0.01
-# A joint whose jump is below this share of the largest jump of a joint does not determine x.
+# A joint whose jump is below this fraction of the largest jump of a joint does not determine x.
 _MOVED = 0.1
 # For x up to SHORT, only the links respond.  For x from LONG, the rotors respond too (docs: which inertia).
 SHORT, LONG = 0.2, 0.75

@@ -13,7 +13,7 @@ from impact_posture.impact.friction.coulomb_impact import coulomb_impact
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.system.arrays import Array
 
-# If the slip velocity is below this share of the approach speed, the point sticks.
+# If the slip velocity is below this fraction of the approach speed, the point sticks.
 _SLIP = 1e-6
 
 

@@ -38,7 +38,7 @@ class Dominance:
 
 
 def find_dominance(objective: WorstCaseObjective, quantities: ImpactQuantities) -> Dominance:
-    """Return the joint with the largest share in ``H``, ``Σ a_i (Wa)_i / H`` summed over its velocity entries."""
+    """Return the joint with the largest share of ``H``: ``Σ a_i (Wa)_i / H`` over the entries of the joint."""
     robot, oracle = objective.robot, objective.oracle
     parts = quantities.jump * oracle.weigh(quantities.jump)
     width = 6 if robot.floating else 0

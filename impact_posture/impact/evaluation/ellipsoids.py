@@ -9,7 +9,7 @@ import numpy as np
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.system.arrays import Array
 
-# An eigenvalue of JJᵀ below this share of the largest eigenvalue is zero, so the contact cannot move along its axis.
+# An eigenvalue of JJᵀ below this fraction of the largest eigenvalue is zero: the contact cannot move along the axis.
 _RANK = 1e-12
 
 

@@ -44,7 +44,7 @@ from impact_posture.impact.worst_case.worst_normal import WorstNormal
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.system.arrays import Array
 
-# If supports that are ten times as stiff change H by more than this share, a warning is shown.
+# If supports that are ten times as stiff change H by more than this fraction, a warning is shown.
 _SOFT = 0.01
 
 
@@ -159,7 +159,8 @@ class Evaluation:
 
 
 _JUMP = ("speed", "restitution", "frictionless", "sticking", "coulomb", "energy_loss")
-# Keys of the block of each single contact.  Posture and objective are not included: they concern all contacts.
+# Keys of the block of each single contact.  Posture and objective are not included, because they are the same for all
+# contacts.
 _CONTACT = (
     "H",
     "G",

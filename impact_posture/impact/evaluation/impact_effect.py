@@ -14,7 +14,7 @@ from impact_posture.system.arrays import Array
 
 @dataclass(frozen=True)
 class WorstJoint:
-    """The joint whose velocity jump is the largest share of its velocity limit.
+    """The joint with the largest ratio of velocity jump to velocity limit.
 
     Attributes:
         name: Name of the joint.

@@ -1,4 +1,4 @@
-"""Value and gradient of an objective, or ``None`` if they do not exist, and its value for each model variant."""
+"""Value and gradient of an objective, or ``None`` if they do not exist, and the value for each model variant."""
 
 from __future__ import annotations
 

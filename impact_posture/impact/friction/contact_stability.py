@@ -18,9 +18,9 @@ from impact_posture.impact.quantities.impact_oracle import ImpactOracle
 from impact_posture.robot.robot_spec import Support
 from impact_posture.system.arrays import Array
 
-# A singular value of J_s below this share of the largest one is a rounding error.
+# A singular value of J_s below this fraction of the largest one is a rounding error.
 _RANK = 1e-9
-# An impulse below this share of the largest impulse is regarded as zero.
+# An impulse below this fraction of the largest impulse is regarded as zero.
 _NONE = 1e-6
 # Number of sides of the pyramid that approximates the friction cone from inside.
 _SIDES = 16
@@ -57,7 +57,7 @@ class ContactStability:
             foot lifts or a sole tips for every friction coefficient.
         feet: Impulse on each foot.  The impulses are within the friction cones if possible; otherwise, they have the
             least pull.
-        freedom: Dimension of the set of possible impulses; zero if they are unique.
+        freedom: Dimension of the set of possible impulses; zero if the impulses are unique.
     """
 
     friction: float | None

@@ -21,7 +21,7 @@ from impact_posture.impact.quantities.impact_oracle import ImpactOracle
 from impact_posture.impact.quantities.sticking_point import ImpulseResponse, no_sticking
 from impact_posture.system.arrays import Array
 
-# An eigenvalue of B_tt below this share of the trace of B is regarded as zero.
+# An eigenvalue of B_tt below this fraction of the trace of B is regarded as zero.
 _RANK = 1e-9
 # Number of Newton steps for the equation 1/‖w‖ = 1/μ.  The steps converge from below.  In a test with 10⁵ random B of
 # condition up to 10⁶, one B needed ten steps, and all others fewer.
@@ -124,12 +124,12 @@ def coulomb_gradient(oracle: ImpactOracle, q: Array, impact: CoulombImpact) -> A
 
 
 def impact_gradients(oracle: ImpactOracle, q: Array, impact: CoulombImpact, covectors: Array, shares: Array) -> Array:
-    """Return the tangent gradient of ``cᵀΔν + s m`` for each covector ``c`` and share ``s``, shape (k, nv).
+    """Return the tangent gradient of ``cᵀΔν + s m`` for each covector ``c`` and factor ``s``, shape (k, nv).
 
-    ``Δν`` is the jump of an impact at ``q`` and ``m`` its effective mass.  ``covectors`` has shape (k, nv) and is
-    constant; ``shares`` has shape (k,).  Let ``K`` be the matrix with ``∂w = K ∂B (n − w)``, and ``z = n − KBn``.
-    Then ``∂m = −m zᵀ∂B p`` and ``∂p = −(K + p zᵀ) ∂B p``, so each gradient is ``∂_q[cᵀM⁻¹Jᵀp − rᵀBp]`` with fixed
-    ``p`` and ``r = (K + z pᵀ)JM⁻¹c + s m z``, all in the axes in which the normal is stated.
+    ``Δν`` is the jump of an impact at ``q``, and ``m`` is the effective mass of this impact.  ``covectors`` has shape
+    (k, nv) and is constant; ``shares`` has shape (k,).  Let ``K`` be the matrix with ``∂w = K ∂B (n − w)``, and ``z =
+    n − KBn``.  Then ``∂m = −m zᵀ∂B p`` and ``∂p = −(K + p zᵀ) ∂B p``, so each gradient is ``∂_q[cᵀM⁻¹Jᵀp − rᵀBp]``
+    with fixed ``p`` and ``r = (K + z pᵀ)JM⁻¹c + s m z``, all in the axes ``normal_frame`` of the contact.
     """
     quantities, p = oracle.quantities(q), impact.impulse
     n, B = quantities.normal, quantities.mobility

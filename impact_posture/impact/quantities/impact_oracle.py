@@ -1,7 +1,7 @@
 """Compute impact quantities by dense linear algebra with Pinocchio, independently of the symbolic kernel.
 
 The symbolic kernel adds masses to the feet; this module instead solves the KKT system ``[M, −J_sᵀ; J_s, εI]``.  The
-support impulses ``f`` are unknowns of this system.  Computing them as ``−J_s a/ε`` would amplify rounding errors by
+support impulses ``f`` are unknowns of this system.  Computing ``f`` as ``−J_s a/ε`` would amplify rounding errors by
 1/ε.
 """
 

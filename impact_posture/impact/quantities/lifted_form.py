@@ -29,7 +29,7 @@ class Lifted:
         variables: Unknowns that the objective adds to the program, shape (k, 1).
         residual: Left sides of the equations ``residual = 0`` that determine the unknowns, shape (r, 1).
         value: The objective as an expression of the configuration and the unknowns.
-        inequalities: Expressions that must be ``≤ 0``; they bound the value from below, shape (i, 1).
+        inequalities: Expressions that must be ``≤ 0``, shape (i, 1).  These inequalities bound the value from below.
         jumps: Unknown velocity jumps whose derivatives are available in closed form.
     """
 

@@ -2,8 +2,8 @@
 
 The objective types ``impulse``, ``sticking`` and ``energy`` increase with a quadratic form ``nᵀK(q)n``
 (:class:`~impact_posture.impact.kinds.impact_kind.QuadraticKind`).  The largest value of this form over a cone can be
-computed exactly (:mod:`impact_posture.impact.worst_case.worst_normal`).  ``speed`` is not such a
-function, and its exact worst normal is not known.
+computed exactly (:mod:`impact_posture.impact.worst_case.worst_normal`).  The objective type ``speed`` is not a
+function of such a form, and no exact worst normal is known for it.
 
 In the program, the dual problem replaces the maximum over the normals.  In the axes of the cone (half angle α), let
 ``P(q) = [a, bᵀ; b, C]`` be the matrix of the form, divided by the value of the form at the start.  With ``c = cos α``

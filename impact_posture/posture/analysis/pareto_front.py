@@ -42,9 +42,9 @@ from impact_posture.system.arrays import Array
 
 # Tolerance below which two prices are treated as equal, relative or in rad or m.
 _STILL = 1e-6
-# One posture is better than another if its objective is lower by more than this share of the initial objective.
+# One posture is better than another if its objective is lower by more than this fraction of the initial objective.
 _EQUAL = 1e-9
-# If the objective increases along the curve by more than this share of the initial objective, the result gets a note.
+# If the objective increases along the curve by more than this fraction of the initial objective, a note is added.
 _RISE = 1e-6
 # Maximum number of other optima from which a path starts, and maximum number of rounds that start from results of
 # neighboring bounds.

@@ -43,7 +43,7 @@ def result_document(
     path: dict[str, object] | None = None,
     global_search: GlobalSearch | None = None,
 ) -> dict[str, object]:
-    """Return the content of ``result.json``; the last four arguments add a block each if they are not ``None``."""
+    """Return the content of ``result.json``; each of the last four arguments adds a block if it is not ``None``."""
     impact, around = prepared.impact, prepared.problem.surroundings
     postures = {"initial": solution.initial, "optimal": solution.q}
     no_path = ""

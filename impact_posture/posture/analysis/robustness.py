@@ -52,7 +52,7 @@ class VariantOptimum:
 
 @dataclass(frozen=True, eq=False)
 class Robustness:
-    """Comparison of the robust optimum with the optimum of the nominal model (stated armature, no payload).
+    """Comparison of the robust optimum with the optimum of the nominal model (unchanged armature, no payload).
 
     Attributes:
         model_variants: All model variants; the nominal model is the first.
@@ -175,8 +175,8 @@ def solve_robustly(
     feasible = [q for q in optima if q is not None and not _broken(problem, q)]
     solution = run(problem, _apart(problem, feasible), len(alone))
     for k, (member, q) in enumerate(zip(alone, optima, strict=True)):
-        # If the robust optimum is better for a variant than its own optimum, the search for its own optimum missed a
-        # better posture.  Repeat the search for this variant, also from the robust optimum.
+        # If the robust optimum is better for a variant than the variant's own optimum, the search for that variant
+        # missed a better posture.  Repeat the search for this variant, also from the robust optimum.
         if q is None or member.objective.value(solution.q) < member.objective.value(q) * (1 - _NOISE):
             optima[k] = _optimum(partial(run, member, (solution.q,), len(alone)))
     return RobustSolution(solution, compare_variants(solution, optima, seed))

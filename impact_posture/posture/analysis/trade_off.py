@@ -11,7 +11,7 @@ from impact_posture.config.problem_settings import Against
 from impact_posture.posture.program.certificate import Certificate
 from impact_posture.system.arrays import Array
 
-# A point is a knee only if its share of the total gain exceeds its share of the total distance by at least this
+# A point is a knee only if its fraction of the total gain exceeds its fraction of the total distance by at least this
 # value.  For a parabola, which every smooth optimum resembles, the excess is at most 1/4, so a parabola has no knee.
 KNEE = 1 / 3
 
@@ -82,7 +82,7 @@ class TradeOff:
 
 
 def find_knee(distances: Array, objectives: Array) -> int | None:
-    """Return the index of the point at which the share of the gain most exceeds the share of the distance.
+    """Return the index of the point with the largest difference: fraction of the gain minus fraction of the distance.
 
     The gain is the decrease of the objective along the curve.  Return ``None`` if the excess is below :data:`KNEE`,
     or if there is no gain.

@@ -40,7 +40,7 @@ class DistancePrice:
         return WithinDistance(Chart(self.model), self.nearest, level)
 
     def within(self, q: Array, level: float) -> Array:
-        """Return a start within the bound ``level``, near the posture ``q``, which may exceed the bound."""
+        """Return a posture near ``q`` with a price of at most ``level``; the price of ``q`` may be higher."""
         away = self.measure(q)
         return q if away <= level else np.array(pin.interpolate(self.model, self.nearest, q, level / away))
 

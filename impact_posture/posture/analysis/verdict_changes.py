@@ -13,18 +13,18 @@ Side = Literal["base", "joints", "impulse", "force"]
 
 # Relative changes below this value are about the same.
 SAME = 0.05
-# Changes of a velocity (m/s or rad/s) below this share of the approach speed (m/s) are negligible.
+# Changes of a velocity (m/s or rad/s) below this fraction of the approach speed (m/s) are negligible.
 _FELT = 0.01
 
 
 @dataclass(frozen=True)
 class PredictedImpact:
-    """The predicted impact in one posture, at the stated speed and friction.
+    """The predicted impact in one posture, for the approach speed and the friction of the problem.
 
     Attributes:
         base_linear: Linear velocity jump of a floating base, m/s; ``None`` for a fixed base.
         base_angular: Angular velocity jump of a floating base, rad/s; ``None`` for a fixed base.
-        joint: Joint whose velocity jump is the largest share of its velocity limit; ``None`` if there are no joints.
+        joint: Joint with the largest ratio of velocity jump to velocity limit; ``None`` if there are no joints.
         impulse: Normal impulse at the first contact, N·s.
         peak_force: Largest normal force, N; ``None`` if no contact stiffness is given, or for several contacts.
         jump: Norm ``‖Δν‖_W`` of the jump of base and joints.

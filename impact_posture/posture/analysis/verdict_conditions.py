@@ -10,7 +10,7 @@ from impact_posture.config.json_block import json_block
 from impact_posture.impact.evaluation.evaluation import Evaluation
 from impact_posture.impact.resolved_impact import ResolvedImpact
 
-# If the attainable speed is below the approach speed by less than this share, it is treated as sufficient, because
+# If the attainable speed is below the approach speed by less than this fraction, it is treated as sufficient, because
 # the verdict shows only three digits of both speeds.
 _REACHED = 5e-3
 # A distance (rad, m) up to this value is a rounding error.

@@ -29,7 +29,7 @@ from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.posture.constraints.constraint import Constraint, LiftedRows, Linearization, digest
 from impact_posture.system.arrays import Array
 
-# If the values for sticking and for sliding differ by less than this share, the contact point is about to slip.  The
+# If the values for sticking and for sliding differ by less than this fraction, the contact point begins to slip.  The
 # certificate then uses the gradients for both cases.
 _KINK = 1e-6
 

@@ -42,8 +42,8 @@ class Requirements:
         largest_jump: Largest allowed velocity jump of a joint per approach speed; infinite for no bound.
         approach_speed: Speed that the joints must be able to give the contact towards the surface, m/s; 0 for no
             requirement.
-        approach_asked: Whether the user stated that the joints must reach the speed.  If the user did not, the
-            requirement is dropped without a note where it cannot be computed.
+        approach_asked: Whether the user gave the setting ``approach``.  If not, and the attainable speed cannot be
+            computed, the requirement is dropped without a note.
         collision: Whether the links must not touch each other, the surface, the ground or the obstacles.
         clearance: Least distance between links, surface, ground and obstacles if ``collision`` is set, m.
         surface: Shape of the surface: ``plane``, ``none``, or the edge length of a square patch, m; if ``None``, the

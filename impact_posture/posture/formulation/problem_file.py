@@ -57,7 +57,7 @@ class Prepared:
 
 
 def read_settings(path: Path, over: dict[str, object] | None = None) -> ProblemSettings:
-    """Read a ``problem.toml`` with paths relative to its folder; options in ``over`` replace keys of the file."""
+    """Read a ``problem.toml``; paths start from its folder, and options in ``over`` replace keys of the file."""
     data = from_folder(read_toml(path), path.resolve().parent, (*_FILES, "weights", "armature", "posture"))
     over = over or {}
     # An option also replaces keys that describe the same quantity in another form.
@@ -138,7 +138,7 @@ def requirements(settings: ProblemSettings, objective: Objective) -> Requirement
 
 
 def _approaches(settings: ProblemSettings, objective: Objective) -> bool:
-    """Return whether the joints must reach the speed; by default, if the user gives a speed and the robot stands."""
+    """Return the setting ``approach``; by default, true if the user gives a speed and the robot does not fly."""
     if settings.approach is not None:
         return settings.approach
     flies = objective.robot.floating and not objective.supports and settings.base != "fixed"

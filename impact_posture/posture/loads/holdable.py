@@ -44,7 +44,7 @@ class Holdable(Constraint):
     """
 
     price = _PRICE
-    # Initial postures are not projected onto this constraint, so that they remain diverse.  Most of them end within
+    # Initial postures are not projected onto this constraint, so that they remain diverse.  Most searches end within
     # the limits anyway.
     projected = False
     by_row = True
@@ -79,7 +79,7 @@ class Holdable(Constraint):
         return np.zeros(self.rows) if self._rest.spares(model.q, 0.0) else self.evaluate(model)[0]
 
     def grown(self, model: Numeric, auxiliaries: Array | None = None) -> Self:
-        """Return the constraint with its rows in the program if ``model.q`` violates them."""
+        """Return the constraint with its rows in the program if ``model.q`` violates the constraint."""
         if self.active or self.value(model).max() <= _KEPT:
             return self
         return type(self)(self._load, self._rest, self._description, active=True)

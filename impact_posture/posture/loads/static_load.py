@@ -96,7 +96,7 @@ class StaticLoad:
         return -tree.generalized_force(wrenches, constant(self.model.gravity.linear))
 
     def torque(self, q: Array, z: Array, *, by_posture: bool = True) -> StaticTorque:
-        """Return ``τ`` and its derivatives at a posture; leaving out ``∂τ/∂q`` saves time.
+        """Return ``τ`` and its derivatives at a posture; without ``by_posture``, ``∂τ/∂q`` is not computed.
 
         Pinocchio computes derivatives for forces that are constant in the axes of the link.  In the axes of the link,
         a force that is constant in the world becomes ``f + f × δ`` if the link turns by δ.

@@ -41,7 +41,8 @@ IPOPT_OPTIONS: dict[str, Any] = {
     "error_on_fail": False,
 }
 # Options for objectives that are a maximum.  The worst case over a cone of normals has quadratic equations, and the
-# objective can decrease while they are violated.  After a step with a large violation, IPOPT may not recover.
+# objective can decrease while these equations are violated.  After a step with a large violation, IPOPT may not
+# recover.
 WORST_OPTIONS = {"ipopt.theta_max_fact": 1.0}
 CONVERGED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 # With these options, IPOPT starts from the given unknowns even if they lie on their bounds.  By default, IPOPT moves
