@@ -34,7 +34,7 @@ Slurm = Annotated[
     ),
 ]
 Out = Annotated[
-    str | None, options.out_option("Folder of the sweep; with show, of the maps.", "./SWEEP, or DIR/maps")
+    str | None, options.out_option("Folder of the sweep; with show, folder of the maps.", "./SWEEP, or DIR/maps")
 ]
 MapAxes = Annotated[
     str | None, options.option("--axes", "Maps", "Axes of the maps.", metavar="A,B", show_default="the two longest")

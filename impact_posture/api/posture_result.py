@@ -142,11 +142,11 @@ class PostureResult:
 
     @checked
     def path(self, *, seed: ZeroOrMore = 0) -> PostureResult:
-        """Return this result, completed by a path from the start to the optimum that respects the robot's limits.
+        """Return this result, completed by a timed path from the start to the optimum.
 
-        See :func:`~impact_posture.path.posture_path.posture_path`.  If no path leads to the
-        best optimum, paths to the other optima are tried, and :attr:`answer` is the posture where the path ends.  A
-        search without ``finish_all`` may not find all optima.
+        The timing respects the robot's limits (:func:`~impact_posture.path.posture_path.posture_path`).  If no path
+        leads to the best optimum, paths to the other optima are tried, and :attr:`answer` is the posture where the
+        path ends.  A search without ``finish_all`` may not find all optima.
 
         Args:
             seed: Seed of the sampling planner.

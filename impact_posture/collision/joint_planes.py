@@ -1,4 +1,4 @@
-"""Bounds on the joints between two bodies whose hulls overlap at postures where their shapes do not."""
+"""Bounds on the joints between two bodies whose hulls overlap at postures where the shapes do not touch."""
 
 from __future__ import annotations
 

@@ -129,7 +129,7 @@ def _circle() -> Array:
 
 @cache
 def _ball() -> Array:
-    """Return points on a spiral around the unit ball whose hull contains the ball."""
+    """Return points on a spiral around the unit ball; the hull of the points contains the ball."""
     from scipy.spatial import ConvexHull
 
     height = 1 - (2 * np.arange(_BALL) + 1) / _BALL

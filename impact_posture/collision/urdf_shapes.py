@@ -128,7 +128,7 @@ def largest_extent(robot: Robot) -> float:
 def read_urdf_shapes(robot: Robot, first: str = "collision") -> UrdfShapes:
     """Read the shapes in the URDF of a robot.
 
-    If a link has both ``collision`` and ``visual`` shapes, the shapes ``first`` are used.
+    ``first`` selects the shapes of a link that has both ``collision`` and ``visual`` shapes.
 
     Raises:
         UrdfError: The URDF has become unreadable, or its links differ from the links of the robot.

@@ -51,7 +51,7 @@ class Mjcf:
         bodies: Index of a Pinocchio joint → name of the body that the joint moves.
         joints: Index of a Pinocchio joint → names of the MuJoCo joints that represent it.
         sites: Index of a frame → name of its site.  If several frames have the same name, only one has a site.
-        moments: Body name → principal moments of inertia, kg·m², shape (3,), that MuJoCo rejects.  The spec contains
+        moments: Body name → principal moments of inertia that MuJoCo rejects, kg·m², shape (3,).  The spec contains
             the nearest accepted moments, and :meth:`compile` sets the exact moments.
     """
 

@@ -1,4 +1,4 @@
-"""The objective whose minimum is the posture with the least peak force: the effective mass with friction."""
+"""The effective mass with friction as an objective; at its minimum, the peak force is least."""
 
 from __future__ import annotations
 

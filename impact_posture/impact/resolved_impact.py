@@ -207,7 +207,7 @@ class ResolvedImpact:
         return (*warnings, f"{self.robot.name} is assumed to be floating freely, {FLOATS}; {self.missing_support}")
 
     def early_touches(self, q: Array) -> tuple[EarlyTouch, ...]:
-        """Return the links that touch the surface before their contact point does at ``q``, shape (nq,)."""
+        """Return the links that touch the surface before the contact point does; ``q`` has shape (nq,)."""
         return early_touches(self.robot, self.objective.contacts, q, self.held)
 
     def to_dict(self, q: Array | None = None) -> dict[str, object]:

@@ -1,4 +1,4 @@
-"""Impulses of several contacts with Coulomb friction at the same time.
+"""Impulses at several simultaneous contacts with Coulomb friction.
 
 Let ``u⁻`` be the velocities of the contact points before the impact, ``B = JM⁻¹Jᵀ``, and ``u = u⁻ + Bp`` the
 velocities after the impact.  At each contact, ``0 ≤ p_n ⊥ u_n ≥ 0`` and ``‖p_t‖ ≤ μ p_n``.  A point that slides has

@@ -188,7 +188,7 @@ class FrictionCones:
         return particular if solution.status != 0 else particular + basis @ solution.x[:-1]
 
     def within(self, particular: Array, basis: Array, friction: float) -> Array | None:
-        """Return the possible impulses within the cones whose largest entry is least; ``None`` if there are none."""
+        """Return the smallest possible impulses within the cones (maximum norm); ``None`` if there are none."""
         A, _ = self.matrix(friction)
         slack = 1e-9 * max(float(np.abs(particular).max(initial=0.0)), 1e-300)
         if not basis.shape[1]:

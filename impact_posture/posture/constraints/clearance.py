@@ -108,7 +108,7 @@ class Clearance(Constraint):
         return closest
 
     def grown(self, model: Numeric, auxiliaries: Array | None = None) -> Self:
-        """Return a constraint whose program also contains violated pairs, or further corners of pairs.
+        """Return the constraint after adding violated pairs, or further corners of pairs, to the program.
 
         A pair with a slack above half of its violation gets no corners, because its present rows are violated too.
         """

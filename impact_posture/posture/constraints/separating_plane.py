@@ -7,9 +7,9 @@ corners x of body a and the corners y of body b satisfy::
     m·x + d + s ≥ r_a + r_b + δ,      n·y − c ≤ 0,      n·n ≤ 1,
     m = Qᵀn,   d = n·t − c            (Q, t: placement of a in the axes of b)
 
-Every row of a corner is linear in the unknowns (n, c, m, d, s), and only four equations of a pair depend on the
-posture.  With the slack s, a solver can start from bodies that penetrate each other.  A half-space has a known plane,
-so n and c are constants.  The program has rows only for corners that a separating plane could touch.
+Each row for a corner is linear in the unknowns (n, c, m, d, s).  Only four equations for each pair of bodies depend
+on the posture.  With the slack s, a solver can start from bodies that penetrate each other.  A half-space has a known
+plane, so n and c are constants.  The program has rows only for corners that a separating plane could touch.
 """
 
 from __future__ import annotations
@@ -154,7 +154,7 @@ class SeparatingPlane:
         return lower, np.array([*[np.inf] * of_a, *[0.0] * of_b, *normal])
 
     def content(self, corners: Corners) -> str:
-        """Return a text with all numbers in the rows except a known plane, whose coefficients are parameters."""
+        """Return the numbers in the rows as text, without the coefficients of a known plane, which are parameters."""
         bodies = [(b.point.joint, b.point.position.tolist(), b.point.rotation.tolist()) for b in (self.a, self.b)]
         points = self._x[sorted(corners.a)].tolist(), self._y[sorted(corners.b)].tolist()
         return repr((bodies, self.b.turns, self.known, points))

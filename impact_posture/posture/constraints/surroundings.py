@@ -229,7 +229,7 @@ class Surroundings:
         return "the base" if not self.robot.floating and self._above(root, plane) < -_BEHIND else ""
 
     def _rigid(self, joints: Iterable[int]) -> frozenset[int]:
-        """Return all joints whose links are fixed relative to the link of one of ``joints``."""
+        """Return all joints whose links are fixed relative to the link of any joint in ``joints``."""
         groups = {self._group[joint] for joint in joints}
         return frozenset(k for k, group in enumerate(self._group) if group in groups)
 

@@ -53,7 +53,7 @@ class Certificate:
             value, and A the Jacobian of constraints and limits.  The multipliers λ have the right signs and are
             computed by least squares.
         primal: Largest violation of a constraint or joint limit, or error of the norm of a quaternion (m, rad).
-        complementarity: Largest product of a multiplier and the distance of its constraint from the bound.
+        complementarity: Largest product of a multiplier and the distance of the constraint value from the bound.
         pose_error_m: Largest position error of a frame whose position is constrained, m.
         pose_error_rad: Largest orientation error of a frame whose orientation is constrained, rad.
         limits: Largest violation of a joint limit, rad or m.
