@@ -141,7 +141,7 @@ def _generate(
 
 
 def _lanes(function: Exported, scalars: Graph, real: Real, constants: Constants) -> dict[str, Any]:
-    """Return the variables of a batch that computes vectors of configurations; empty if C has no vector operation."""
+    """Return the variables of a batch of vectors of configurations; empty if an operation has no vector form in C."""
     layout = lay_out(scalars, [function.outputs], _BATCH_BLOCK)
     computed = {k for block in layout.blocks for k in block.nodes} | layout.inlined
     if not all(k in layout.trig or scalars.nodes[k].op in ARITHMETIC for k in computed):

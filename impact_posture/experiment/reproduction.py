@@ -43,7 +43,7 @@ PAPER: dict[str, PaperRow] = {
     "solo8-push": PaperRow(0.411, 0.342, 0.168),
     "talos-push": PaperRow(0.305, 0.166, 0.456),
 }
-# Scenario → what of it was chosen by the numbers of the paper.
+# Scenario → description of its values that were fitted to the numbers of the paper.
 _AERIAL = (
     "nothing was fitted. The paper does not state the speed, the gains, the duration of the windows or the masses of "
     "the arm, and the integral grows with all of them"

@@ -45,7 +45,7 @@ def table_one(results: Reproduction) -> str:
 
 
 def fitted(results: Reproduction) -> str:
-    """Return a list in Markdown: what was chosen by the paper's numbers, and how far the nominal values differ."""
+    """Return a Markdown list: values fitted to the paper, and the ratio of our nominal value to the paper's."""
     lines = []
     for scenario in results.scenarios:
         paper, nominal = PAPER.get(scenario), results.row(scenario, "nominal")

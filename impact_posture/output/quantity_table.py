@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 class QuantityRow(NamedTuple):
     """A quantity at the initial and at the optimal posture, with its unit and its meaning in a few words.
 
-    ``key`` is its symbol or name.  A value is ``None`` where it is undefined.
+    ``key`` is the symbol or name of the quantity.  A value is ``None`` where it is undefined.
     """
 
     key: str

@@ -38,7 +38,7 @@ class SolvedPostures:
 
     Attributes:
         initial: Initial posture, shape (nq,).
-        answer: Posture of ``posture.json``, shape (nq,): the optimum, or the posture where a path to it ends.
+        answer: Posture of ``posture.json``, shape (nq,): the optimum, or the posture where the path towards it ends.
         path: Null-space path between both postures.
         document: Content of ``result.json``.
         mapped: Map of the self-motion manifold; ``None`` if it was not computed.

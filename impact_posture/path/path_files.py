@@ -32,8 +32,8 @@ def write_path(folder: Path, robot: Robot, path: PosturePath) -> None:
 
     The rows of the CSV have the time ``t`` (s), positions ``q:…``, velocities ``v:…`` and accelerations ``a:…`` by
     name.  The angle of a continuous joint has no jumps at full turns.  The YAML is a
-    ``trajectory_msgs/JointTrajectory``.  Between two rows, the limits hold for the quintic polynomial that has the
-    values of both rows.
+    ``trajectory_msgs/JointTrajectory``.  Between two rows, a motion along the quintic polynomial through both rows
+    respects the limits.
     """
     names, angles = positions(robot, path.q)
     columns = [printable(name) for name in robot.tangent_names]

@@ -33,7 +33,8 @@ class PosturePath:
 
     Attributes:
         found: Whether the path ends at the optimum.
-        reason: Why the path does not end at the optimum, and which limits the timing ignores; else empty.
+        reason: Why the path does not end at the optimum, and which limits the timing ignores; empty if neither
+            applies.
         method: Method of the search: ``continuation`` or ``sampling``; empty without a motion.
         timing: ``time-optimal``, ``scaled`` or ``slowed``; empty without a motion.
         objective: Objective at the end of the path.

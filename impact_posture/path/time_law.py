@@ -56,7 +56,7 @@ class TimeLaw:
 
 
 def polynomial(coefficients: Array, duration: float) -> TimeLaw:
-    """Return the law whose ``s`` is a polynomial of ``t/T``, highest power first, shape (k,)."""
+    """Return the law whose ``s`` is a polynomial of ``t/T``, with ``coefficients`` from the highest power on."""
     from scipy.interpolate import PPoly
 
     duration, powers = _whole(duration), np.arange(len(coefficients))[::-1]

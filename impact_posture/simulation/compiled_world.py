@@ -52,7 +52,7 @@ class Ticks(NamedTuple):
 class CompiledWorld:
     """Loop in C of a world and its controller.
 
-    The loop computes the same as :class:`World` and :class:`CompiledTick`, except for rounding errors.
+    The loop gives the same results as :class:`World` and :class:`CompiledTick`, except for rounding errors.
     :meth:`World.push` and :meth:`World.throw` still work between calls of :meth:`take`.  Before other methods of the
     world, call :meth:`World.reset`, because the loop updates only the time of the world.
     """

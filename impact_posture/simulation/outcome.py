@@ -25,13 +25,13 @@ OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)
 _EVERY = 25
 # A joint origin that is deeper behind a surface, m, has moved through it.  Compression of a contact is less deep.
 _DEEP = 0.02
-# Outside this range of the measured jump divided by the predicted jump, the prediction does not fit.
+# The prediction fits if the measured jump divided by the predicted jump is in this range.
 _FITS = (0.67, 1.5)
 
 
 @dataclass(frozen=True)
 class Event:
-    """Violation of a bound: description ``what``, ``time`` (s), and resulting ``status`` of the run."""
+    """Violation of a bound of the scenario: description ``what``, ``time`` (s), and ``status`` of the run."""
 
     status: Outcome
     time: float
@@ -70,8 +70,8 @@ def links_behind(setup: Setup, runs: Iterable[Run]) -> tuple[str, ...]:
 def doubts(setup: Setup, runs: Iterable[Run], metrics: Iterable[Metrics], ratio: float | None) -> tuple[str, ...]:
     """Return a warning for each reason to doubt the numbers of completed runs.
 
-    ``ratio`` is the mean of the measured jump divided by the predicted jump.  The prediction for a push neglects the
-    controller, which works during the whole push, so its ratio gives no warning.
+    ``ratio`` is the mean of the measured jump divided by the predicted jump.  A push gets no warning about its ratio,
+    because the prediction neglects the controller, which acts during the whole push.
     """
     lines = []
     if setup.scenario.push is None and ratio is not None and not _FITS[0] <= ratio <= _FITS[1]:

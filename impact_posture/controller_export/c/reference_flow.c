@@ -10,13 +10,13 @@
 
 /* Step of the finite differences, rad. */
 #define IP_PROBE 1e-4
-/* If the step towards a posture of the path is shorter, rad (m), the flow continues to the next posture. */
+/* If the step towards a posture of the path is shorter than this, rad (m), the flow continues to the next one. */
 #define IP_REACHED 0.02
-/* Least displacement between two evaluations that is used to update the curvature estimates, rad (m). */
+/* Curvature estimates are updated only if two evaluations are at least this far apart, rad (m). */
 #define IP_MOVED 1e-6
-/* If a direction is shorter after its orthogonalization, rounding errors are large, so it is orthogonalized twice. */
+/* A direction that is shorter than this after its orthogonalization has large errors and is orthogonalized twice. */
 #define IP_NEW 0.1
-/* At a lower speed, rad/s (m/s), the point where the flow would stop is too near for finite differences. */
+/* Below this speed, rad/s (m/s), the point where the flow would stop is too near for finite differences. */
 #define IP_SLOW 1e-3
 
 /* Evaluate the model and the Jacobian of the constraints at a posture with v = 0.  Write the errors of the
@@ -219,7 +219,7 @@ static void ip_flow_direct(ip_context *c)
   }
 #endif
   ip_flow_solve(f);
-  /* The step also decreases the energies of pull and springs, but only the decrease of H is the gain. */
+  /* The step also decreases the distance term and the energy of the springs, but the gain counts only H. */
   f->gain = fmin(f->gain * ip_flow_root(f), -ip_dot(f->slope, f->wanted, IP_NV));
   f->resting = f->gain < (f->resting ? 4.0 : 1.0) * c->p.flow_epsilon[0] || f->remains <= 0.0;
   if (f->resting) {

@@ -6,9 +6,9 @@
 /* Distance that the flow keeps from joint limits, rad (m), and from limits of static controls, as a share. */
 #define IP_AIM 2e-3
 #define IP_RESERVE 8e-3
-/* If the squared length of a row in the free directions is smaller, motions along these directions cannot correct it. */
+/* If the squared length of a row in the free directions is smaller than this, the row is ignored. */
 #define IP_FLAT 1e-6
-/* If the sine of the tilt is smaller, the slope of the tilt is set to zero, because the tilt axis is undefined. */
+/* If the sine of the tilt is below this value, the slope of the tilt is zero, because the tilt axis is undefined. */
 #define IP_LEVEL 1e-6
 
 /* Return the largest absolute value from the entry `first` on. */

@@ -158,7 +158,7 @@ static int ip_flow_change(const ip_flow *f, const ip_params *p, double period, d
   return 1;
 }
 
-/* Set the acceleration of the flow, which includes the return to contacts and tasks, within all limits. */
+/* Set the acceleration within all limits, including the acceleration of the return to contacts and tasks. */
 static void ip_flow_govern(ip_context *c)
 {
   enum { N = IP_NV };

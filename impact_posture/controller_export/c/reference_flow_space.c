@@ -11,7 +11,7 @@
 #define IP_TINY 1e-12
 /* Points with a smaller distance from a line, m, are treated as points on the line. */
 #define IP_ON_LINE 1e-9
-/* Added to the diagonal of equations that are singular if the base can move while the joints are at rest. */
+/* This value is added to the diagonal of equations that are singular if the base can move without the joints. */
 #define IP_IDLE 1e-9
 /* Accelerations may always use at least this share of the half range of a control. */
 #define IP_LEFT 0.1

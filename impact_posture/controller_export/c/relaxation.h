@@ -1,4 +1,4 @@
-/* Lexicographic answer to a tick whose strict levels cannot hold, as in impact_posture/tsid/relaxation.py.
+/* Lexicographic answer to a tick whose strict levels are infeasible, as in impact_posture/tsid/relaxation.py.
  *
  *     min 1/2 z'Hz + g'z   subject to   lower <= [z; A z] <= upper
  *

@@ -174,7 +174,7 @@ static int finish_level(Relaxation *r, int level, int missed) {
     return find_step(r);
 }
 
-/* Minimize the error of a level without a change of the errors of the levels above.  Later levels keep this error. */
+/* Minimize the error of a level without changing the errors of the levels above.  Later levels keep this error. */
 static int solve_level(Relaxation *r, int level) {
     int missed = 0, same = 0;
     list_rows(r, level, NULL);

@@ -2,7 +2,7 @@
 
 /* Largest time step of ramps, in periods.  A tick after a long pause would otherwise end a ramp. */
 #define IP_LONGEST 10.0
-/* A measurement is invalid if the sum of its squares is larger (numbers of about 1e8 m, rad/s or N). */
+/* A measurement is invalid if the sum of its squares exceeds this value (numbers of about 1e8 m, rad/s or N). */
 #define IP_ABSURD 1e16
 /* Times with a smaller difference, s, are equal, because sums of periods are not exact. */
 #define IP_SAME 1e-9

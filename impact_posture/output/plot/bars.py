@@ -18,7 +18,7 @@ from impact_posture.system.escape import plot_label
 
 NOTES = (
     "∫‖ν‖dt mixes meters and radians, as in the paper. Intervals: 95 % of the mean over the seeds. The paper prints "
-    "no gains. Compare its numbers with each other only.",
+    "no gains. Compare the numbers of the paper only with each other.",
 )
 # The axis is long enough for values of the paper up to this multiple of the largest mean.
 _FAR = 2.0

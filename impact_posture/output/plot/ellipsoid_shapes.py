@@ -157,7 +157,7 @@ def outline(points: Array) -> Array:
 
 
 def square(center: Array, n: Array, side: float) -> Array:
-    """Return the corners of a square perpendicular to the unit vector ``n``, closed, shape (3, 5)."""
+    """Return the closed outline of a square perpendicular to the unit vector ``n``, shape (3, 5)."""
     # One edge follows the projection of the world axis that is most perpendicular to n.
     first = np.eye(3)[int(np.argmin(np.abs(n)))]
     first = first - (first @ n) * n

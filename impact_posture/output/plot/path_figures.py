@@ -132,7 +132,7 @@ _EXTRA = {"distance": "distance", "force": "extra force"}
 
 
 def tradeoff_figure(view: ResultView) -> Figure:
-    """Draw the objective over the bound on distance or force, and below it H, G, V and S."""
+    """Draw the objective over the bound on distance or force, and H, G, V and S in a second panel."""
     data = required(view.tradeoff, "trade-off", "tradeoff", "run optimize again with `tradeoff`")
     knee = [_KNEE.format(_EXTRA[data.against])] if data.knee is not None else []
     notes = [NOTES[data.against] + _LINES, *knee, share_notes("at these postures", data)]

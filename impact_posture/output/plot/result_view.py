@@ -70,7 +70,7 @@ class ResultView:
     Attributes:
         objective: Objective with robot, contacts, metric and supports.
         q_initial: Initial posture, shape (nq,).
-        q_optimal: Optimal posture, or the posture where a path to it ends, shape (nq,).
+        q_optimal: Optimal posture, or the posture where the path towards it ends, shape (nq,).
         speed: Approach speed along the normal, m/s.
         restitution: Coefficient of restitution e, in [0, 1].
         path: Quantities along the null-space path between both postures; ``None`` if unknown.

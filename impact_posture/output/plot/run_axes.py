@@ -117,7 +117,7 @@ def _draw(axes: Any, cell: Cell, views: Sequence[RunView]) -> None:
             # Noisy curves are solid, because the gaps of dashed lines would not be visible.
             look = looks[entry % len(looks)] | ({"linestyle": "-", "linewidth": 0.7} if panel.noisy else {})
             name = panel.names[entry] if panel.names else ""
-            # Without NaN, the curve is a straight line across gaps.
+            # Leave out NaN values, so that the curve is a straight line across gaps.
             inside = (view.t >= clip.begin) & (view.t <= clip.end) & np.isfinite(values)
             label = plot_label(name) if name else None
             axes.plot(clip.x(view.t[inside]), values[inside], label=label, **look)

@@ -96,7 +96,7 @@ def _draw_surfaces(body: Any, data: SelfMotionMap, y: Array, label: str, view: R
 
 
 def _mark(axes: Any, data: SelfMotionMap, x: Array, y: Array, mine: NDArray[np.bool_]) -> None:
-    """Mark the start, the optimum and the optima of the multi-start search, if they belong to the points ``mine``."""
+    """Mark the start, the optimum and the optima of the multi-start search that belong to the points ``mine``."""
     for name, look in _MARKS.items():
         places = getattr(data, name)
         here = places[mine[places]]

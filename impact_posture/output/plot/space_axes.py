@@ -11,7 +11,7 @@ from mpl_toolkits.mplot3d import Axes3D
 from impact_posture.output.plot.style import SMALL, TINY, text_width
 from impact_posture.system.arrays import Array
 
-# No ticks within this share of the axis length at both ends, where two axes meet.
+# Ticks are left out within this share of the axis length at both ends, where two axes meet.
 _CORNER = 0.07
 
 

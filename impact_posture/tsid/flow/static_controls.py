@@ -30,8 +30,9 @@ _TINY = 1e-12
 class StaticControls:
     """Static controls ``u = G⁺(h − Jᵀf)``, measured from the middle of the control ranges.
 
-    At ±1, a control reaches the permitted share of its limits.  Of all contact wrenches ``f`` that carry the base,
-    the result uses the wrenches with the least weighted norm.  Redundant rotors share the load evenly.
+    The value ±1 means that a control uses the permitted share of its limits.  Of all contact wrenches ``f`` that
+    carry the base, the result uses the wrenches with the least weighted norm.  Redundant rotors share the load
+    evenly.
 
     Attributes:
         limited: Controls that have limits, shape (m,).
@@ -48,7 +49,7 @@ class StaticControls:
         wrench = np.array([1.0] * 3 + [_MOMENT] * 3)
         self._ease = 1.0 / np.concatenate([np.zeros(0), *(wrench[: c.size] for c in contacts)])
         self._count, self._base = self._ease.size, base
-        # Maps a generalized force, without the part that contacts produce, to the controls.
+        # Matrix that maps a generalized force, without the part that contacts produce, to the controls.
         self._inverse = np.linalg.pinv(actuators.G, rcond=1e-9)[self.limited] / self._half[:, None]
         # Generalized forces of the contacts per unit wrench on the base, shape (nv, base).
         self._carried = np.zeros((actuators.G.shape[0], base))
