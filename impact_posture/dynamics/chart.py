@@ -40,8 +40,8 @@ class Chart:
 
     def __init__(self, model: pin.Model) -> None:
         self.slots: list[JointSlot] = []
-        # Pairs of an index in q and an index in x.  ``copied`` is for equal numbers.  ``angles`` is for a cosine in
-        # q, which its sine follows, and the angle in x.
+        # Pairs of an index in q and an index in x.  ``copied`` contains entries with equal values.  ``angles``
+        # contains the entry of a cosine in q, which the sine follows, and the entry of the angle in x.
         copied: list[tuple[int, int]] = []
         angles: list[tuple[int, int]] = []
         start = 0

@@ -102,7 +102,7 @@ def build_model(
         raise UrdfError(fault, where=str(path), hint=hint)
     if model.nv > MOST_DEGREES_OF_FREEDOM:
         fault = f"has {model.nv} degrees of freedom, more than the supported {MOST_DEGREES_OF_FREEDOM}"
-        raise UrdfError(fault, where=str(path), hint="fix joints in the URDF that hardly matter")
+        raise UrdfError(fault, where=str(path), hint="in the URDF, fix the joints that hardly matter")
     mimics, lost = _mimics(root)
     return model, (*check_inertias(root, model, path, accept_inertias), *lost), mimics
 
@@ -119,7 +119,7 @@ def _check_depth(root: ET.Element, path: Path) -> None:
         level = [child for link in level for child in children.get(link, ())]
         below.difference_update(level)
     if any(link in children for link in level):
-        hint = "fix joints in the URDF that hardly matter"
+        hint = "in the URDF, fix the joints that hardly matter"
         raise UrdfError(f"has a chain of more than {_DEEPEST} joints", where=str(path), hint=hint)
     if below:
         link = next(link for link in parents if link in below)

@@ -2,7 +2,7 @@
 
 An impact-robust arm is often stretched along the normal, and a stretched arm cannot move in this direction.  In a
 stretched posture, the impact changes the joint velocities little, but the joints cannot bring the contact to the
-surface at speed.
+surface at the required speed.
 """
 
 from __future__ import annotations
