@@ -110,7 +110,8 @@ class Clearance(Constraint):
     def grown(self, model: Numeric, auxiliaries: Array | None = None) -> Self:
         """Return the constraint after adding violated pairs, or further corners of pairs, to the program.
 
-        A pair with a slack above half of its violation gets no corners, because its present rows are violated too.
+        If the slack of a pair exceeds half of its violation, the pair gets no further corners, because the present
+        rows are violated too.
         """
         values, active = self.value(model), dict(self.active)
         unknowns = {} if auxiliaries is None else self._unknowns(auxiliaries)

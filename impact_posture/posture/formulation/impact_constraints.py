@@ -19,8 +19,8 @@ def impact_constraints(
 ) -> list[Constraint]:
     """Return the bounds on the impact and the constraints on the feet for all model variants.
 
-    Friction cones are convex.  If the feet stay in place for an impact at each single contact, they therefore stay
-    for impacts at all contacts at the same time.  A payload moves the center of mass.  The constraint on the center
+    Friction cones are convex.  Therefore, if the feet stay in place for an impact at each single contact, the feet
+    also stay for impacts at all contacts at once.  A payload moves the center of mass.  The constraint on the center
     of mass, if ``constraints`` contains it, is therefore repeated for each model with a payload.
 
     Raises:
