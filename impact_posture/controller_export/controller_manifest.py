@@ -15,7 +15,7 @@ from impact_posture.codegen.manifest_reader import Loose, read_checked
 from impact_posture.system.libraries import build_parts, library_path
 
 SCHEMA = "impact-posture/controller/1"
-# Largest size that a manifest may state.  A larger size would be an error and allocate too much memory.
+# Largest size that a manifest may state.  A larger size is a mistake, and would allocate too much memory.
 _MOST = 100_000
 
 Size = Annotated[int, Field(ge=-1, le=_MOST)]

@@ -227,7 +227,8 @@ def _check(robot: Robot, formulation: TaskFormulation) -> None:
         if type(task) not in known:
             raise refuse(f"task '{task.name}' ({type(task).__name__}) has no C code")
     if isinstance(formulation.posture, ReferenceFlowPosture) and formulation.contacts and not robot.floating:
-        # Such a flow raises an error in Python, too, so the hint "run it in Python" would be wrong.
+        # A flow with contacts and a fixed base raises an error in Python, too, so the hint "run it in Python" would
+        # be wrong.
         what = f"'{formulation.posture.name}' with contacts needs a floating base"
         raise InputError(what, where="controller export", hint="leave out `contacts`")
     if formulation.row_limits:

@@ -115,7 +115,7 @@ def draw_runs(job: Job, runs: Sequence[Run], document: Document, folder: Path, f
 
 
 def draw_side_by_side(jobs: Sequence[Job], store: JobStore, folder: Path, formats: Sequence[str]) -> None:
-    """Draw figures that compare controllers in one scenario.  They show the first run of each job."""
+    """Draw figures that compare controllers in one scenario.  The figures show the first run of each job."""
     tell("drawing")
     views = []
     for job in jobs:

@@ -60,9 +60,10 @@ RECOMMENDED: dict[str, str] = {
     "talos-push": "robust-flow",
 }
 
-# Target → function and text.  The function returns true if a row misses the target.  Its second argument is the
-# reduction in the paper.  The text describes the miss.  The target ``recovery`` rejects controllers that only delay
-# the motion.  Saturation times are multiples of a tick, so a difference below 1e-9 s is a rounding error.
+# Target → function and text.  The function returns true if a row misses the target.  The second argument of the
+# function is the reduction in the paper.  The text describes the miss.  The target ``recovery`` rejects controllers
+# that only delay the motion.  Saturation times are multiples of a tick, so a difference below 1e-9 s is a rounding
+# error.
 _TARGETS: dict[str, tuple[Callable[[ControllerRow, float], bool], str]] = {
     "reduction": (lambda row, paper: _mean(row.reduction) < paper, "less than the paper's reduction"),
     "recovery": (lambda row, _: _mean(row.recovery) <= 0, "no less motion than nominal over the recovery"),

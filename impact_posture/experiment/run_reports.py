@@ -201,7 +201,7 @@ def _series(stem: Path, sign: int) -> Path:
 
 
 def _job(document: Document, scenario: str) -> Job:
-    """Return the job of a document.  Its scenario is the name of a shipped scenario, or the path of a file."""
+    """Return the job of a document.  ``Job.scenario`` is the name of a shipped scenario, or the path of a file."""
     name, source = str(document["scenario"]), str(document["source"])
     shipped = name in known_scenarios() and Path(source) == scenario_path(name)
     scenario = scenario or (name if shipped else source)

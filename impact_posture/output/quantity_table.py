@@ -65,7 +65,7 @@ def _felt_rows(impact: ResolvedImpact, initial: dict[str, Any], optimal: dict[st
     """Return the rows of base, worst joint, normal impulse and peak force."""
     at = f"at {impact.speed:g} m/s, friction {impact.contact.friction:g}"
     rows, jumps = list[QuantityRow](), [block["jump"]["coulomb"] for block in (initial, optimal)]
-    # Results of earlier versions have neither effects nor normal impulses.
+    # The ``result.json`` of earlier versions has neither effects nor normal impulses.
     effects: list[dict[str, Any]] = [(jump or {}).get("effect") or {} for jump in jumps]
     if all(effects):
         pairs = [(f"base {key}", f"base_{key}", unit) for key, unit in (("linear", "m/s"), ("angular", "rad/s"))]

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 DEVIATION = 1e-5
 # Largest number of times that the number of knots is doubled.  At a corner, each doubling halves the deviation.
 _DOUBLINGS = 7
-# Number of knots of the projected spline per knot of the spline.  This factor divides the deviation by about 8⁴.
+# Number of knots of the projected spline per knot of the spline.  Such a spline divides the deviation by about 8⁴.
 _FINER = 8
 # Step of central differences along the curve, whose length is 1.
 _STEP = 1e-5
@@ -37,8 +37,8 @@ _AT_CORNERS, _BETWEEN = 8, 2
 class PathCurve:
     """The cubic spline ``q₀ ⊕ z(s)``, ``0 ≤ s ≤ 1``, through two or more postures, projected onto the equalities.
 
-    The projected curve is as smooth as the spline.  It is not projected onto inequalities and joint limits, because
-    its velocity would jump where they become active.
+    The projected curve is as smooth as the spline.  The curve is not projected onto inequalities and joint limits,
+    because its velocity would jump where they become active.
 
     ``s`` contains the values of the parameter at the postures, evenly spaced, shape (n,).  ``z`` contains the tangent
     coordinates of the postures at the first posture, shape (n, nv).
@@ -65,7 +65,7 @@ class PathCurve:
 
     @property
     def places(self) -> Array:
-        """Values of ``s`` for the check of limits: knots and values between them, more at corners."""
+        """Values of ``s`` for the check of limits: knots and values between knots, closer together at corners."""
         parts = [
             np.linspace(a, b, _AT_CORNERS if corner else _BETWEEN, endpoint=False)
             for (a, b), corner in zip(pairwise(self.s), self.corners, strict=True)

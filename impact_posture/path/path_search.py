@@ -14,8 +14,8 @@ from impact_posture.system.arrays import Array
 
 # Largest number of postures that the search pulls onto the constraints for a target.
 EFFORT = 5000
-# An elastic band shortens a path that is longer than the straight distance by more than the first share.  Shortcuts
-# first shorten a path that exceeds the second share; they need more time.
+# An elastic band shortens a path that is longer than the straight distance by more than the first share.  Shortcuts,
+# which need more time, first shorten a path that exceeds the second share.
 _BENT, _DETOUR = 0.02, 0.2
 _SHORTCUTS = 24
 # Number of postures of each elastic band, and number of sweeps over a band.

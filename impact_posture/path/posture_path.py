@@ -21,7 +21,7 @@ from impact_posture.system.arrays import Array
 
 # Largest number of optima to try, best first.
 _OPTIMA = 5
-# A shorter path counts as no motion.  A posture with a smaller relative gain counts as no better.
+# A path below this tangent length counts as no motion.  A relative gain below the second value counts as no gain.
 _NO_MOTION, _NO_GAIN = 1e-6, 1e-6
 # Largest number of reached postures to evaluate if no optimum is reached.
 _MOST_VISITED = 400
@@ -46,7 +46,7 @@ class PosturePath:
         length: Tangent length of the path, rad mixed with m.
         max_violation: Largest violation of a constraint or joint limit at the postures.
         use: Shares of the limits over time; ``None`` without a motion.
-        objectives: Objective at the times of ``use``, shape (m,).
+        objectives: Objective at the times ``use.at``, shape (m,).
     """
 
     found: bool

@@ -19,10 +19,10 @@ def slowed(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedC
     """Return a motion that is only as slow at each ``s`` as the limits require; ``None`` if they allow no motion.
 
     With ``x = ṡ²``, the load is ``g(s) + x c(s) + s̈ d(s)``, where ``g`` is the load of gravity.  The limits are
-    convex.  They therefore allow ``(x, s̈)`` if ``x`` is at most half of its limit at ``s̈ = 0``, and ``s̈`` at most
-    half of its limit at ``x = 0``.  One forward and one backward pass with ``dx/ds = 2 s̈`` give the largest such
-    ``x(s)`` (Bobrow et al. 1985).  Between two knots, the second derivative of the curve is linear, so the limits are
-    checked at only a few values of ``s``, most of them at corners.
+    convex.  The limits therefore allow ``(x, s̈)`` if ``x`` is at most half of its limit at ``s̈ = 0``, and ``s̈`` at
+    most half of its limit at ``x = 0``.  One forward and one backward pass with ``dx/ds = 2 s̈`` give the largest
+    such ``x(s)`` (Bobrow et al. 1985).  Between two knots, the second derivative of the curve is linear, so the
+    limits are checked at only a few values of ``s``, most of them at corners.
     """
     s = curve.places
     zero, speed = np.zeros(space.model.nv), space.problem.robot.velocity_limits

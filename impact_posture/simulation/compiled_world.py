@@ -53,8 +53,8 @@ class CompiledWorld:
     """Loop in C of a world and its controller.
 
     The loop gives the same results as :class:`World` and :class:`CompiledTick`, except for rounding errors.
-    :meth:`World.push` and :meth:`World.throw` still work between calls of :meth:`take`.  Before other methods of the
-    world, call :meth:`World.reset`, because the loop updates only the time of the world.
+    :meth:`World.push` and :meth:`World.throw` still work between calls of :meth:`take`.  Before you call other
+    methods of the world, call :meth:`World.reset`, because the loop updates only the time.
     """
 
     def __init__(self, world: World, tick: CompiledTick, contents: dict[str, Any], library: ctypes.CDLL) -> None:

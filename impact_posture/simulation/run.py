@@ -73,7 +73,8 @@ def run(factory: ControllerFactory, controller: str, *, seed: int = 0, mode: Mod
         only: Sign of the push to run; by default, every sign of the scenario.
 
     Raises:
-        SimulationDiverged: The state diverged within two ticks.  If it diverges later, the run ends without an error.
+        SimulationDiverged: The state diverged within two ticks.  If the state diverges later, the run ends without an
+            error.
         ControllerNotFound: The controller is unknown.
         InputError: A tick is not a multiple of the physics step, a tick or the run is too long, or ``only`` is not 1
             or -1.

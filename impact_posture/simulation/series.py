@@ -19,7 +19,8 @@ Flags = NDArray[np.bool_]
 STATUSES: tuple[Status, ...] = tuple(Status)
 # Times that differ by less than this are treated as equal, because sums of time steps have rounding errors, s.
 SAME = 1e-9
-# Maximum duration of the recovery window, s.  It starts with the impact and is long enough for delayed motions.
+# Maximum duration of the recovery window, s.  The window starts with the impact and is long enough for delayed
+# motions.
 RECOVERY = 1.0
 
 

@@ -77,7 +77,8 @@ class Walk:
     def __init__(
         self, template: ConstrainedProblem, settings: ProblemSettings, nlp: PostureNLP, timer: Timer
     ) -> None:
-        # The caller identifies the template by its ``id``.  This reference prevents that the ``id`` is used again.
+        # The caller identifies the template by its ``id``.  While this reference exists, no other object gets the
+        # same ``id``.
         self._template, self.settings, self.timer = template, settings, timer
         self.problem, self.nlp = template, nlp
         self._relaxed: ElasticProgram | None = None
@@ -188,7 +189,7 @@ class _Attempt:
         return None
 
     def searched(self, guess: Array) -> PointResult | None:
-        """Return the result of the multistart search of ``optimize``.  It also restarts from results in collision."""
+        """Return the result of the multistart search of ``optimize``, which also restarts from collisions."""
         settings = self._walk.settings
         try:
             solution = solve(

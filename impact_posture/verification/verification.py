@@ -38,8 +38,8 @@ NO_COMPILER = f"no C compiler: {GET_ONE}"
 
 # Largest relative errors that pass: for M and J; for H, G, Λ_c and analytic gradients; for finite differences.
 _MODEL, _VALUES, _DIFFERENCES = 1e-9, 1e-9, 1e-8
-# For standing robots, these errors replace _VALUES and _DIFFERENCES.  They are larger, because the condition number
-# of the linear system is about 1/ε, where ε is the compliance of the supports.
+# For standing robots, these errors replace _VALUES and _DIFFERENCES.  These errors are larger, because the condition
+# number of the linear system is about 1/ε, where ε is the compliance of the supports.
 _ON_FEET = 1e-7, 1e-6
 
 

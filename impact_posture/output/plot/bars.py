@@ -65,7 +65,7 @@ def bars_figure(rows: Sequence[Bar]) -> Figure:
 def _panel(axes: Any, name: str, group: Sequence[Bar], room: int) -> None:
     ours = max((row.mean + row.half_width for row in group if np.isfinite(row.mean)), default=0.0)
     papers = [row.paper for row in group if row.paper is not None]
-    # The paper used another robot, so its values can be much larger.  They must not make the bars short.
+    # The paper used another robot, so its values can be much larger.  These values must not make the bars short.
     near = [paper for paper in papers if paper <= _FAR * ours or ours == 0]
     end = 1.08 * (max([ours, *near]) or 1.0)
     for place, row in enumerate(group):

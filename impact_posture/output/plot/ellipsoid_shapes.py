@@ -64,7 +64,7 @@ def root(matrix: Array) -> Array:
 def half_width(matrix: Array, direction: Array) -> float:
     """Return the half-width ``√(dᵀΛd)`` of ``{x: xᵀΛ⁻¹x ≤ 1}`` along a unit vector ``d``.
 
-    It is half the distance between the two tangent planes that are perpendicular to ``d``.
+    The half-width is half the distance between the two tangent planes that are perpendicular to ``d``.
     """
     return float(np.sqrt(max(float(direction @ matrix @ direction), 0.0)))
 

@@ -136,7 +136,7 @@ def _notes(panels: Sequence[Panel], cells: Sequence[Sequence[Cell | None]]) -> l
 
 
 def _since_impact(view: RunView) -> Clip:
-    """Return the clip of a whole run.  Its time zero is the push, because the time before the push differs by run."""
+    """Return the clip of a whole run.  Time zero is the push, because the time before the push differs by run."""
     clip = whole(view)
     if not (view.pushed and view.impacts):
         return clip

@@ -24,8 +24,8 @@ from impact_posture.robot.urdf import example_robot_data
 from impact_posture.system.arrays import Array
 from impact_posture.system.libraries import source_key
 
-# Maximum number of triangles of all meshes on a page.  It limits the size of the page, and the time to draw the robot
-# without a GPU.
+# Maximum number of triangles of all meshes on a page.  This maximum limits the size of the page, and the time to draw
+# the robot without a GPU.
 _MOST_TRIANGLES = 150_000
 # Number of steps into which the largest extent of a mesh is divided.  Corners are rounded to these steps.
 _LEVELS = 65535

@@ -63,8 +63,8 @@ MEANING: dict[str, str] = {
     "walker": "the posture target follows the negative gradient of H",
 }
 CONTROLLERS = tuple(MEANING)
-# This suffix adds a stiffness to a controller.  The stiffness is the stiffness of the impact-robust term at the
-# posture in which the controller rests.
+# A controller with this suffix has an additional stiffness: the stiffness of the impact-robust term at the posture in
+# which the controller rests.
 _STIFF = "-stiff"
 _PLAIN = {
     "nominal": Driver,

@@ -117,9 +117,9 @@ class ReferenceSpreadingDriver(ImpactFeedbackDriver):
     - Before the impact, the target speed is a function of the position: ``√(2 a s)``, at most the speed of the
       scenario.  The reference continues behind the surface, in case the impact is late.  There is no position
       feedback along the approach.
-    - The interim mode starts at the first touch.  It ends when the contact has lasted for ``SUSTAINED`` (s), or after
-      ``INTERIM`` (s).  In this mode, no task has velocity feedback.  The position target continues with the speed
-      before the impact, which establishes the contact.
+    - The interim mode starts at the first touch.  The interim mode ends when the contact has lasted for ``SUSTAINED``
+      (s), or after ``INTERIM`` (s).  In this mode, no task has velocity feedback.  The position target continues with
+      the speed before the impact, which establishes the contact.
     - After the impact, the position target moves exponentially, with the time constant ``SETTLE`` (s), to the rest
       position of the scenario.  The velocity targets of all tasks start at ``J_y ν⁺`` and decay with the same time
       constant.  ``ν⁺ = ν⁻ + Δν`` is the velocity after a rigid, inelastic impact at the velocity ``ν⁻`` before the

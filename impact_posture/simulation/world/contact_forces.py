@@ -159,7 +159,7 @@ class ContactLog:
         starts = np.cumsum([0, *(s.forces.size for s in steps[:-1])])
         first, at = np.concatenate([s.rows for s in steps]), np.repeat(np.arange(len(steps)), counts)
         geoms, frames = np.concatenate([s.geoms for s in steps]), np.concatenate([s.frames for s in steps])
-        # MuJoCo also lists contacts just outside the surface.  They do not push and have no address (−1).
+        # MuJoCo also lists contacts just outside the surface.  Such contacts do not push and have no address (−1).
         pushing = first >= 0
         first = (first + np.repeat(starts, counts))[pushing]
         at, geoms, sizes, frames = at[pushing], geoms[pushing], sizes[pushing], frames[pushing].reshape(-1, 3, 3)

@@ -109,7 +109,7 @@ def _add_rotor_link(mjcf: Mjcf, robot: Robot) -> tuple[list[str], Array]:
     propulsion, names, points = robot.spec.propulsion, [], [np.zeros((0, 3))]
     shapes = [] if propulsion is None else read_urdf_shapes(robot)[0]
     for shape in (shape for shape in shapes if propulsion is not None and shape.link == propulsion.frame):
-        # The robot warns of shapes that cannot be used.
+        # Skip shapes that cannot be used.  The warnings of the robot already name them.
         with suppress(UnusableShape):
             corners = shape_points(shape.load(largest_extent(robot)).mesh)
             link = robot.model.frames[robot.frame_id(shape.link)]
@@ -183,7 +183,7 @@ def _lowest(shape: Shape, placement: pin.SE3, normal: Array) -> Array:
 
 
 def _add_rotors(mjcf: Mjcf, robot: Robot) -> None:
-    """Add a MuJoCo motor for each rotor.  Its control is the thrust, and its wrench acts on the base."""
+    """Add a MuJoCo motor for each rotor.  The control of the motor is the thrust, and its wrench acts on the base."""
     propulsion = robot.spec.propulsion
     if propulsion is None:
         return

@@ -29,8 +29,8 @@ _NEAR = 1e-3
 _SPENT = 9.9e-4
 # Distance that the flow keeps from the joint limits, rad (m).
 _AIM = 2e-3
-# Distance that the flow keeps from the limits of the static controls, as a share of the range.  Their slope is only
-# estimated, so this distance is larger than ``_AIM``.
+# Distance that the flow keeps from the limits of the static controls, as a share of the range.  The slope of the
+# static controls is only estimated, so this distance is larger than ``_AIM``.
 _RESERVE = 8e-3
 # If the squared length of a row in the free directions is smaller than this, the row is ignored.
 _FLAT = 1e-6
