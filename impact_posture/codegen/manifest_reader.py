@@ -67,12 +67,12 @@ class _Manifest(Loose):
 
 
 def read_manifest(path: Path) -> tuple[dict[str, Any], Path]:
-    """Read the manifest of an export; return its content and the folder of the export.
+    """Read the manifest of an export; return the content of the manifest and the folder of the export.
 
     ``path`` is the folder, or the manifest file.
 
     Raises:
-        SpecError: The folder has no manifest or several, or the manifest is damaged.
+        SpecError: The folder has no manifest or several manifests, or the manifest is damaged.
     """
     manifest, checked, file = read_checked(path, SCHEMA, _Manifest, "export", "codegen")
     sizes = [("armature", len(checked.armature), checked.nv)]
@@ -95,7 +95,7 @@ def read_checked(
     folder, and ``command`` is the command that writes the folder.
 
     Raises:
-        SpecError: The folder has no manifest or several, or the manifest is damaged.
+        SpecError: The folder has no manifest or several manifests, or the manifest is damaged.
     """
     files = [path] if not os.path.isdir(path) else sorted(p for p in path.glob("*.json") if _is_manifest(p, schema))
     if len(files) != 1:

@@ -58,7 +58,7 @@ def daqp_sources(folder: Path | None = None) -> dict[str, bytes]:
     """
     if folder is not None:
         return _checked(lambda name: _from_folder(folder, name), str(folder), _FOLDER_HINT)
-    archive, again = cache_folder() / f"daqp-{VERSION}.tar.gz", "delete the file; the next run downloads it again"
+    archive, again = cache_folder() / f"daqp-{VERSION}.tar.gz", "delete it; the next run downloads it again"
     if not is_cached(archive):
         with building(archive) as place:
             _download(place)

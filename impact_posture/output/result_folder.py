@@ -115,6 +115,6 @@ def _export(folder: Path, prepared: Prepared, postures: SolvedPostures) -> Writt
     except CompilerError as error:
         # Keep the posture even if the compiler failed.  The command line reports the error.
         compiler_error, exported = error.line, write(force=True, check=False)
-    # With a separate record, the export can be replaced alone, with the products of its Makefile.
+    # The export has its own record of files, so it can be replaced alone, with the products of its Makefile.
     write_record(code, "export", products(exported.prefix))
     return Written(folder, exported, compiler_error)

@@ -76,7 +76,7 @@ def read_postures(content: bytes) -> list[list[float] | None]:
 
 
 def passes_of(path: Path, key: str, points: int) -> int:
-    """Return 1 or 2, the passes after which a shard file was written; 0 if it is incomplete or has another key."""
+    """Return after how many passes a shard file was written, 1 or 2; 0 if it is incomplete or has another key."""
     from pyarrow import ArrowException, parquet
 
     try:

@@ -37,7 +37,7 @@ _BOX_FACES = np.array(
     [[0, 2, 1, 1, 2, 3, 4, 5, 6, 5, 7, 6, 0, 1, 4, 1, 5, 4], [2, 6, 3, 3, 6, 7, 0, 4, 2, 2, 4, 6, 1, 3, 5, 3, 7, 5]],
     dtype=np.uint32,
 ).reshape(-1, 3)
-# Number of bytes at the beginning of a COLLADA file that are searched for colors.
+# Colors are searched only in this number of bytes at the beginning of a COLLADA file.
 _HEAD = 200_000
 
 Color = tuple[float, ...]

@@ -25,7 +25,8 @@ _LEAST = 1e-8
 _LEVEL = 1e-6
 # Largest violation of a limit during braking, rad (m) for joints, and a share of the range for static controls.
 _NEAR = 1e-3
-# Up to this violation, the flow may still move along a limit.  With ``_NEAR``, it would slowly cross the limit.
+# If a limit is violated by less than this, the flow may move along the limit.  With ``_NEAR`` instead, the flow would
+# slowly cross the limit.
 _SPENT = 9.9e-4
 # Distance that the flow keeps from the joint limits, rad (m).
 _AIM = 2e-3

@@ -108,7 +108,7 @@ class ReferenceFlowPosture(JointPosture):
 
     @property
     def level(self) -> float:
-        """Whether the flow may move: 0 or 1."""
+        """1 if the flow may move, otherwise 0."""
         return 0.0 if self._flow is None else float(self._flow.on)
 
     def reset(self, state: State) -> None:

@@ -44,7 +44,7 @@ class DaqpSolver:
         self._cold = True
 
     def solve(self, qp: QP) -> Solved | None:
-        """Return the solution, or ``None`` if the program is infeasible or the solver failed (:attr:`infeasible`)."""
+        """Return the solution, or ``None`` if the program is :attr:`infeasible` or the solver failed."""
         sense = qp.sense if self._cold else None
         self._flag = self._model.update(qp.H, qp.g, qp.A, qp.upper, qp.lower, sense)
         if self._flag >= 0:
