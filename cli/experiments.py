@@ -50,11 +50,12 @@ def rows_table(page: Page, rows: tuple[ControllerRow, ...] | list[ControllerRow]
     page.table(head, lines, right=(1, 2, 3, 4))
     page.line("  q_total: motion in the impact windows (rad, m); peak jump in rad/s and m/s", style="dim")
     page.line("  less %: reduction of q_total; in 1 s %: from each impact until 1 s later", style="dim")
+    _loads_table(page, rows)
     nominal, *others = jsonable(rows)
     if nominal["controller"] == "nominal":
         for row in others:
             if row["reduction"] is not None:
-                page.line(f"  {headline(row, nominal)}")
+                page.pairs([("", headline(row, nominal))])
     if any(row.failed for row in rows):
         page.line("  no reduction if a run of either controller did not complete; means are over completed runs",
                   style="dim")  # fmt: skip
@@ -65,3 +66,22 @@ def rows_table(page: Page, rows: tuple[ControllerRow, ...] | list[ControllerRow]
             page.line(f"  {row.controller} reaches the stops of {', '.join(row.stops)}")
     if not all(row.rested for row in rows):
         page.line("  * was not at rest before the push: the numbers include its own motion", style="dim")
+
+
+def _loads_table(page: Page, rows: tuple[ControllerRow, ...] | list[ControllerRow]) -> None:
+    """Write a table of the effects on base, joints and contact, with one row per controller."""
+    from impact_posture.experiment.reproduction_summary import joint_text
+
+    lines = []
+    for row in rows:
+        if not row.metrics:
+            continue
+        keys = ("base_linear", "base_angular", "peak_force", "impulse")
+        numbers = [f"{row.metrics[key].mean:.3g}" if key in row.metrics else "–" for key in keys]
+        lines.append((f"  {row.controller}", *numbers, joint_text(row)))
+    if lines:
+        page.gap()
+        head = ("  controller", "base m/s", "rad/s", "force N", "N·s", "worst joint, % of its limit")
+        page.table(head, lines, right=(1, 2, 3, 4))
+        when = "in the pushes" if rows[0].approach is None else "within 15 ms of the touch"
+        page.line(f"  largest changes of velocity, and normal impulse, {when}", style="dim")

@@ -11,12 +11,13 @@ from pydantic_core import to_jsonable_python
 
 from impact_posture.dynamics.mjcf import import_mujoco
 from impact_posture.errors import InputError
+from impact_posture.impact.evaluation.impact_effect import mean_load
 from impact_posture.posture.analysis.result_document import versions
 from impact_posture.posture.program.compiled_solver import CompileMode
 from impact_posture.simulation.controllers.controller_factory import ControllerFactory, Mode
 from impact_posture.simulation.metrics import Metrics, measure
 from impact_posture.simulation.outcome import doubts, gravest, judge, links_behind
-from impact_posture.simulation.prediction import predict
+from impact_posture.simulation.prediction import Prediction, predict
 from impact_posture.simulation.run import Run, run
 from impact_posture.simulation.scenario_file import read_scenario
 from impact_posture.simulation.seed_variation import set_up_with
@@ -117,11 +118,12 @@ def execute(job: Job, factory: ControllerFactory | None = None) -> tuple[tuple[R
         raise InputError(f"has no push with sign {job.sign}", where=scenario.name, hint="omit `sign`")
     runs = run(factory, job.controller, seed=job.seed, mode=job.mode, gain=job.gain, only=job.sign)
     metrics = [measure(factory.setup, record) for record in runs]
-    parts = [_run_document(factory, *each) for each in zip(runs, metrics, strict=True)]
+    predictions = [predict(factory.setup, factory.objective(), record) for record in runs]
+    parts = [_run_document(factory, *each) for each in zip(runs, metrics, predictions, strict=True)]
     status = gravest(part["status"] for part in parts)
     completed = status == "completed"
     offline = factory.offline(job.controller)
-    prediction = _mean_prediction([p for part in parts for p in part["prediction"]]) if completed else None
+    prediction = _mean_prediction([impact for each in predictions for impact in each]) if completed else None
     warnings = [*factory.setup.warnings, *factory.warnings]
     if prediction is not None:
         warnings += [*links_behind(factory.setup, runs), *doubts(factory.setup, runs, metrics, prediction["ratio"])]
@@ -172,20 +174,26 @@ def combined(metrics: list[Metrics]) -> Metrics:
     """Combine the metrics of several runs.
 
     Counts are added, and ``stops`` contains the joints of all runs.  ``peak_jump_max`` and ``peak_force`` are the
-    largest values.  ``rested`` is true if it is true for all runs.  All other metrics are means.
+    largest values, and ``joint`` is the worst joint of any run.  ``rested`` is true if it is true for all runs.  All
+    other metrics are means.
     """
-    first = metrics[0]
+    first, load = metrics[0], mean_load([m.load for m in metrics])
     if len(metrics) == 1:
         return first
-    values = {key: float(np.mean([getattr(m, key) for m in metrics])) for key in asdict(first) if key != "stops"}
+    effect = {key: getattr(load, key) for key in ("base_linear", "base_angular", "joint")}
+    averaged = {*asdict(first)} - {*effect, "stops"}
+    values = {key: float(np.mean([getattr(m, key) for m in metrics])) for key in averaged}
     counts = ("relaxed_ticks", "failed_ticks", "contacts", "contacts_asked")
     ticks = {key: sum(getattr(m, key) for m in metrics) for key in counts}
     largest = {key: max(getattr(m, key) for m in metrics) for key in ("peak_jump_max", "peak_force")}
     stops = tuple(dict.fromkeys(stop for m in metrics for stop in m.stops))
-    return Metrics(**{**values, **ticks, **largest, "stops": stops, "rested": all(m.rested for m in metrics)})
+    rested = all(m.rested for m in metrics)
+    return Metrics(**{**values, **ticks, **largest, **effect, "stops": stops, "rested": rested})
 
 
-def _run_document(factory: ControllerFactory, record: Run, metrics: Metrics) -> Document:
+def _run_document(
+    factory: ControllerFactory, record: Run, metrics: Metrics, predictions: tuple[Prediction, ...]
+) -> Document:
     events = judge(factory.setup, record)
     content = {
         "sign": record.sign,
@@ -195,15 +203,20 @@ def _run_document(factory: ControllerFactory, record: Run, metrics: Metrics) -> 
         "ticks": record.series.t.size,
         "metrics": metrics.to_dict(),
         "windows": record.windows,
-        "prediction": predict(factory.setup, factory.objective(), record),
+        "prediction": predictions,
     }
     return dict(jsonable(content))
 
 
-def _mean_prediction(impacts: list[Document]) -> Document:
-    """Return the mean of each predicted quantity over the impacts; ``None`` if it is undefined for an impact."""
+def _mean_prediction(impacts: list[Prediction]) -> Document:
+    """Return the mean of each predicted quantity over the impacts; ``None`` if it is undefined for an impact.
+
+    The loads are combined by :func:`~impact_posture.impact.evaluation.impact_effect.mean_load`.
+    """
     means: Document = {"impacts": len(impacts)}
     for key in ("H", "G", "V", "S", "approach", "frictionless", "sticking", "coulomb", "measured", "ratio"):
-        values = [impact[key] for impact in impacts]
+        values = [getattr(impact, key) for impact in impacts]
         means[key] = None if not values or None in values else float(np.mean(values))
+    for key in ("predicted_impact", "measured_impact"):
+        means[key] = mean_load([getattr(impact, key) for impact in impacts]) if impacts else None
     return means

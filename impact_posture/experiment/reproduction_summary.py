@@ -60,7 +60,8 @@ def scenario_table(rows: Sequence[ControllerRow]) -> str:
     """Return a Markdown table with one row per controller of a scenario."""
     head = (
         "controller|status|q_total_impact|reduction|over the recovery|peak jump|in the recovery|saturated inside, s|"
-        "outside, s|relaxed ticks|peak force, N|over nominal's|H before|measured / predicted jump|targets"
+        "outside, s|relaxed ticks|peak force, N|over nominal's|normal impulse, N·s|base, m/s|base, rad/s|worst joint|"
+        "H before|measured / predicted jump|targets"
     )
     lines = []
     for row in rows:
@@ -74,6 +75,8 @@ def scenario_table(rows: Sequence[ControllerRow]) -> str:
                 percent(row.recovery) if row.controller != "nominal" else "–",
                 *(interval_text(row.metrics[name], digits) for name, digits in _COLUMNS.items()),
                 "–" if row.force is None else f"{row.force.mean:.2f}",
+                *(_known(row, name) for name in ("impulse", "base_linear", "base_angular")),
+                markdown(joint_text(row)),
                 "–" if row.H is None else f"{row.H:.3g}",
                 "–" if row.ratio is None else f"{row.ratio:.2f}",
                 targets_text(row),
@@ -196,6 +199,19 @@ def remarks(results: Reproduction, scenario: str) -> list[str]:
         if row.failed:
             lines.append(f"`{row.controller}`: {markdown('; '.join(row.failed))}.")
     return lines
+
+
+def _known(row: ControllerRow, name: str) -> str:
+    return interval_text(row.metrics[name]) if name in row.metrics else "–"
+
+
+def joint_text(row: ControllerRow) -> str:
+    """Return name, change of velocity and share of the velocity limit of the worst joint in the impacts of a row."""
+    if row.joint is None:
+        return "–"
+    share = row.metrics.get("joint_share")
+    limit = "" if share is None else f", {100 * share.mean:.3g} %"
+    return f"{row.joint.name} {row.metrics['joint_velocity'].mean:.3g} {row.joint.unit}{limit}"
 
 
 def interval_text(value: Interval, digits: int = 3) -> str:

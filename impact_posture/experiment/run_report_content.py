@@ -24,6 +24,14 @@ _METRICS = (
     ("peak_force", "N", "largest normal force in the impact windows"),
     ("slip", "m", "way that the contact slid in the impact windows"),
 )
+# Effects on base, joints and contact within 15 ms of the touch: key, unit and meaning.
+_LOADS = (
+    ("base_linear", "m/s", "largest change of the base's linear velocity, mean of the contacts"),
+    ("base_angular", "rad/s", "the same of its angular velocity"),
+    ("joint_velocity", "", "largest change of velocity of the worst joint: the largest share of its limit"),
+    ("joint_share", "", "the same, as a share of its velocity limit"),
+    ("impulse", "N·s", "impulse of the contact along the normal, mean of the contacts"),
+)
 # Metrics with another meaning in push scenarios: key → meaning.
 _PUSH_MEANINGS = {
     "peak_jump": "largest ‖ν‖ from a push on until its window ends, mean of the pushes",
@@ -52,15 +60,19 @@ def run_content(folder: Path, document: Document, view: RunView, job: Job) -> Co
     verdict += [f"t = {event['time']:.2f} s: {event['what']}" for event in document["events"]]
     wanted = [] if metrics is None else table_metrics(view)
     rows = [(key, number(metrics[key]), unit, words) for key, unit, words in wanted]
+    tables = []
     if document["prediction"] is not None:
         H = number(document["prediction"]["H"])
         rows.append(("H before", H, "jump²/(N·s)²", "jump² per impulse² at the impacts"))
+        # Runs of older versions do not contain the loads.
+        if document["prediction"].get("measured_impact") is not None:
+            tables.append(_load_table(document["prediction"], view))
     return Content(
         title=run_header([view])[0],
         command=typed_command(folder) or shlex.join(["impact-posture", *options]),
         facts=tuple(run_header([view])[1]),
         verdict=tuple(verdict),
-        tables=(Table("Metrics", ("", "value", "unit", "meaning"), tuple(rows)),),
+        tables=(Table("Metrics", ("", "value", "unit", "meaning"), tuple(rows)), *tables),
         moves=_MOVES,
         notes=tuple(document["warnings"]),
     )
@@ -70,6 +82,23 @@ def table_metrics(view: RunView) -> list[tuple[str, str, str]]:
     """Return key, unit and meaning of each metric in the table of a report."""
     meanings = _PUSH_MEANINGS if view.pushed else {}
     return [(key, unit, meanings.get(key, meaning)) for key, unit, meaning in _METRICS]
+
+
+def _load_table(prediction: Mapping[str, Any], view: RunView) -> Table:
+    """Return the table of the effects on base, joints and contact, as measured and as predicted."""
+    measured, predicted = (_load_cells(prediction[f"{key}_impact"]) for key in ("measured", "predicted"))
+    title = "In the pushes" if view.pushed else "Within 15 ms of the touch"
+    rows = [(key, measured[key], predicted[key], unit, meaning) for key, unit, meaning in _LOADS]
+    return Table(title, ("", "measured", "rigid prediction", "unit", "meaning"), tuple(rows))
+
+
+def _load_cells(load: Mapping[str, Any]) -> dict[str, str]:
+    joint = load["joint"]
+    cells = {key: "–" if load.get(key) is None else number(load[key]) for key, *_ in _LOADS}
+    if joint is not None:
+        cells["joint_velocity"] = f"{joint['name']}: {number(joint['velocity'])} {joint['unit']}"
+        cells["joint_share"] = "–" if joint["share"] is None else number(joint["share"])
+    return cells
 
 
 def _summary(metrics: Mapping[str, Any]) -> str:
@@ -82,8 +111,10 @@ def comparison_content(folder: Path, document: Document, view: RunView) -> Conte
     rows = document["rows"]
     labels = [str(row["controller"]) for row in rows]
     table = [("status", *(str(row["status"]) for row in rows), "", "")]
-    for key, unit, meaning in table_metrics(view):
+    for key, unit, meaning in (*table_metrics(view), *_LOADS):
         table.append((key, *(_mean(row["metrics"].get(key)) for row in rows), unit, meaning))
+    joints = [(row.get("joint") or {}).get("name", "–") for row in rows]
+    table.append(("joint", *joints, "", "the worst joint of any run"))
     nominal = next((row for row in rows if row["controller"] == "nominal"), None)
     compared = [row for row in rows if row["reduction"] is not None and row is not nominal]
     lines = ["No reduction is known."] if nominal is None or not compared else [

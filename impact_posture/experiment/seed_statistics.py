@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from scipy.special import stdtrit
 
 from impact_posture.experiment.jobs import Document
+from impact_posture.impact.evaluation.impact_effect import ImpactLoad, WorstJoint, worst_joint
+from impact_posture.posture.analysis.verdict_changes import changes, outcome_of, relative_change
 from impact_posture.simulation.metrics import Metrics
 from impact_posture.simulation.outcome import Outcome, gravest
 
 # Metrics for which a mean and a confidence interval are computed.
-QUANTITIES = tuple(f.name for f in fields(Metrics) if f.name not in ("stops", "contacts", "contacts_asked", "rested"))
+_OTHERS = ("stops", "contacts", "contacts_asked", "rested", "joint")
+QUANTITIES = (*(f.name for f in fields(Metrics) if f.name not in _OTHERS), "joint_velocity", "joint_share")
 
 # An interval is shown only for at least this number of samples.  For two samples, the quantile of Student's t is
 # 12.7, so the interval is too wide to be useful.
@@ -71,7 +75,8 @@ class ControllerRow:
         runs: Number of runs.
         completed: Number of runs that completed.
         failed: Seed and reason of each run that did not complete, one line per run.
-        metrics: Name in :data:`QUANTITIES` → mean over the completed runs; empty if no run completed.
+        metrics: Name in :data:`QUANTITIES` → mean over the completed runs; empty if no run completed.  Quantities
+            that do not exist for this robot are left out.
         reduction: Reduction of ``q_total_impact`` relative to nominal with the same seed, as a share.  ``None`` if
             there are no nominal runs, or if a run of either controller did not complete.
         recovery: Like ``reduction``, but for ``q_total_recovery``.
@@ -81,6 +86,8 @@ class ControllerRow:
         H: Mean of H just before the impacts.
         ratio: Mean of the measured jump divided by the jump that the rigid-body model predicts with friction.
         force: ``peak_force`` divided by its nominal value with the same seed; ``None`` if ``reduction`` is ``None``.
+        joint: The worst joint of any completed run.
+        approach: Mean of the approach speed, m/s; ``None`` for pushes.
     """
 
     scenario: str
@@ -98,12 +105,16 @@ class ControllerRow:
     H: float | None
     ratio: float | None
     force: Interval | None
+    joint: WorstJoint | None = None
+    approach: float | None = None
 
 
 def headline(row: Document, nominal: Document) -> str:
-    """Return one line on a controller: its motion, peak jump and peak force, relative to nominal.
+    """Return one line on a controller: its motion, peak jump and peak force, relative to nominal, and the outcome.
 
-    Both arguments are rows of ``comparison.json``, with a reduction in ``row``.
+    The outcome follows from the effects on base, joints and contact, by the rule of the verdict of ``optimize``
+    (:func:`~impact_posture.posture.analysis.verdict_changes.outcome_of`).  Both arguments are rows of
+    ``comparison.json``, with a reduction in ``row``.
     """
     less = row["reduction"]["mean"]
     parts = [f"{row['controller']} moves {abs(less):.0%} {'less' if less > 0 else 'more'}"]
@@ -112,15 +123,45 @@ def headline(row: Document, nominal: Document) -> str:
     # The peak force of a push is the push.
     if abs(row["force"]["mean"] - 1) > _SAME:
         costs.append(f"peak force × {row['force']['mean']:.2g}")
-    return "; ".join([*parts, ", ".join(costs)])
+    parts.append(", ".join(costs))
+    # Results of older versions do not contain the impulse.
+    if "impulse" in row["change"]:
+        parts.append(_outcome(row, nominal))
+    return "; ".join(parts)
+
+
+def _outcome(row: Document, nominal: Document) -> str:
+    """Return the outcome in words.  A change within its interval counts as zero."""
+    intervals = {name: Interval(**interval) for name, interval in row["change"].items()}
+    doubtful = {name for name, each in intervals.items() if each.shown is not None and abs(each.mean) <= each.shown}
+    before = {name: float(interval["mean"]) for name, interval in nominal["metrics"].items()}
+    after = {name: before[name] + (0.0 if name in doubtful else each.mean) for name, each in intervals.items()}
+    force = relative_change(before["peak_force"], after["peak_force"])
+    first, last = (_load(values, nominal["joint"]) for values in (before, after))
+    outcome = outcome_of(changes(first, last, row["approach"] or 0.0, force))
+    compared = {field.name for field in fields(ImpactLoad)} | {"joint_velocity", "joint_share"}
+    return f"the impact itself is {outcome}{' beyond the intervals' if doubtful & compared else ''}"
+
+
+def _load(means: Mapping[str, float], joint: Document | None) -> ImpactLoad:
+    """Return the effects on base, joints and contact from means of :data:`QUANTITIES` and the worst ``joint``."""
+    worst = joint and WorstJoint(joint["name"], means["joint_velocity"], joint["unit"], means.get("joint_share"))
+    base = means.get("base_linear"), means.get("base_angular")
+    return ImpactLoad(*base, worst or None, means["impulse"], means["peak_force"], means["peak_jump"])
 
 
 def value_of(document: Document, quantity: str) -> float:
     """Return the value of a metric in the document of a job."""
+    return float(_value(document, quantity))
+
+
+def _value(document: Document, quantity: str) -> Any:
+    """Return the value of a metric in the document of a job, or ``None`` if the robot has no such quantity."""
     metrics = document["metrics"]
-    if quantity.startswith("saturation_"):
-        return float(metrics["saturation_s"][quantity.removeprefix("saturation_")])
-    return float(metrics[quantity])
+    for key, table in (("saturation_", metrics["saturation_s"]), ("joint_", metrics["joint"] or {})):
+        if quantity.startswith(key):
+            return table.get(quantity.removeprefix(key))
+    return metrics[quantity]
 
 
 def fate(document: Document) -> str:
@@ -152,6 +193,10 @@ def row_of(
         ratio = share(name)
         return ratio and replace(ratio, mean=1 - ratio.mean)
 
+    compared = [*good, *(n for _, n in pairs if n["status"] == "completed")]
+    known = [name for name in QUANTITIES if all(_value(d, name) is not None for d in compared)]
+    joint = worst_joint([WorstJoint(**d["metrics"]["joint"]) for d in good if d["metrics"]["joint"]])
+    pushed = any(d["prediction"]["coulomb"] is None for d in good)
     return ControllerRow(
         scenario=scenario,
         controller=controller,
@@ -159,15 +204,17 @@ def row_of(
         runs=len(documents),
         completed=len(good),
         failed=tuple(f"seed {d['seed']}: {fate(d)}" for d in documents if d["status"] != "completed"),
-        metrics={name: Interval.of([value_of(d, name) for d in good]) for name in QUANTITIES} if good else {},
+        metrics={name: Interval.of([value_of(d, name) for d in good]) for name in known} if good else {},
         reduction=reduction("q_total_impact"),
         recovery=reduction("q_total_recovery"),
-        change={name: paired(name, lambda mine, nominal: mine - nominal) for name in QUANTITIES} if fair else {},
+        change={name: paired(name, lambda mine, nominal: mine - nominal) for name in known} if fair else {},
         stops=tuple(dict.fromkeys(stop for d in good for stop in d["metrics"]["stops"])),
         rested=all(d["metrics"]["rested"] for d in good),
         H=_mean([d["prediction"]["H"] for d in good]),
         ratio=_mean([d["prediction"]["ratio"] for d in good]),
         force=share("peak_force"),
+        joint=joint,
+        approach=None if pushed else _mean([d["prediction"]["approach"] for d in good]),
     )
 
 

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
+from impact_posture.impact.evaluation.impact_effect import ImpactLoad, WorstJoint, impact_effect, mean_load
 from impact_posture.simulation.run import Run
 from impact_posture.simulation.series import Array, Flags, Series, Window
 from impact_posture.simulation.setup import Setup
@@ -41,6 +42,13 @@ class Metrics:
         contacts: Number of contacts (or pushes) that happened.
         contacts_asked: Number of contacts (or pushes) that the scenario requests.
         rested: Whether the robot was at rest before the push or throw; true for contacts.
+        base_linear: Largest change of the linear velocity of a floating base, in the time of ``peak_jump``, averaged
+            over the contacts, m/s.  ``None`` for a fixed base, or without contact.
+        base_angular: Like ``base_linear``, but of the angular velocity, rad/s.
+        joint: Joint whose largest change of velocity, in the time of ``peak_jump``, is the largest share of its
+            velocity limit in any contact.  ``None`` without contact.
+        impulse: Impulse of the contact along the normal, in the time of ``peak_jump``, averaged over the contacts,
+            N·s.  For pushes, the impulse of the push.
     """
 
     q_total_impact: float
@@ -62,6 +70,16 @@ class Metrics:
     contacts: int
     contacts_asked: int
     rested: bool = True
+    base_linear: float | None = None
+    base_angular: float | None = None
+    joint: WorstJoint | None = None
+    impulse: float = 0.0
+
+    @property
+    def load(self) -> ImpactLoad:
+        """Effects of the impacts on base, joints and contact."""
+        effect = self.base_linear, self.base_angular, self.joint
+        return ImpactLoad(*effect, self.impulse, self.peak_force, self.peak_jump)
 
     def to_dict(self) -> dict[str, object]:
         """Return the JSON content, with the saturations in a separate table."""
@@ -90,8 +108,9 @@ def measure(setup: Setup, run: Run) -> Metrics:
         return sum(distance(series.v[series.slice(w.begin, w.end)]) for w in run.of(kind))
 
     # Leave out missed contacts, because they would appear as small impacts.
-    jumps = [jump(setup, series, w) for w in impacts if w.touched] or [0.0]
-    later = [_peak(setup, series, w, w.end) for w in run.of("recovery") if w.touched] or [0.0]
+    loads = [impact_load(setup, series, w) for w in impacts if w.touched]
+    load = mean_load(loads or [ImpactLoad(None, None, None, 0.0, 0.0, 0.0)])
+    later = [_largest(_change(setup, series, w, w.end)) for w in run.of("recovery") if w.touched] or [0.0]
     stopped = (series.at_stop[inside] & ~series.at_stop[0]).any(axis=0)
     return Metrics(
         q_total_impact=distance(series.v[inside]),
@@ -99,8 +118,8 @@ def measure(setup: Setup, run: Run) -> Metrics:
         q_total_impact_joints=distance(series.v[inside, base:]),
         q_total_dwell=distance_in("dwell"),
         q_total_recovery=distance_in("recovery"),
-        peak_jump=float(np.mean(jumps)),
-        peak_jump_max=float(np.max(jumps)),
+        peak_jump=load.jump,
+        peak_jump_max=max((each.jump for each in loads), default=0.0),
         peak_recovery=float(np.mean(later)),
         peak_force=float(series.peak[inside].max(initial=0.0)),
         saturation_inside=integral((rotors | joints)[inside]),
@@ -113,6 +132,10 @@ def measure(setup: Setup, run: Run) -> Metrics:
         contacts=sum(w.touched for w in impacts),
         contacts_asked=contacts.count if contacts else 1,
         rested=run.rested,
+        base_linear=load.base_linear,
+        base_angular=load.base_angular,
+        joint=load.joint,
+        impulse=load.impulse,
     )
 
 
@@ -134,17 +157,33 @@ def before(series: Series, window: Window) -> int:
     return int(max(series.slice(window.begin, window.end).start - 1, 0))
 
 
-def jump(setup: Setup, series: Series, window: Window) -> float:
-    """Return the largest ``‖ν(t) − ν⁻‖`` within :data:`JUMP` after the start of a window.
+def impact_load(setup: Setup, series: Series, window: Window) -> ImpactLoad:
+    """Return the effects on base, joints and contact within :data:`JUMP` after the start of an impact window.
 
-    For pushes, return the largest ``‖ν‖`` in the window.
+    The jump is the largest ``‖ν(t) − ν⁻‖``.  For pushes, it is the largest ``‖ν‖`` in the window.  Likewise, the base
+    and each joint have their largest changes.  The peak force is the largest in the window.
     """
-    return _peak(setup, series, window, window.end if setup.scenario.push else window.begin + JUMP)
+    end, inside = window.end if setup.scenario.push else window.begin + JUMP, series.slice(window.begin, window.end)
+    ticks, k = series.slice(window.begin, end), before(series, window)
+    change = _change(setup, series, window, end)
+    effect = impact_effect(setup.robot, change if len(change) else np.zeros(setup.robot.nv))
+    impulse = series.impulse[max(ticks.stop - 1, k)] - series.impulse[k]
+    return ImpactLoad(
+        effect.base_linear,
+        effect.base_angular,
+        effect.joint,
+        # The second push or throw has the opposite direction.
+        abs(float(setup.scenario.normal @ impulse)),
+        float(series.peak[inside].max(initial=0.0)),
+        _largest(change),
+    )
 
 
-def _peak(setup: Setup, series: Series, window: Window, end: float) -> float:
-    """Return the largest ``‖ν(t) − ν⁻‖``, or for pushes ``‖ν‖``, from the start of a window until ``end``."""
+def _change(setup: Setup, series: Series, window: Window, end: float) -> Array:
+    """Return ``ν(t) − ν⁻``, or for pushes ``ν``, from the start of a window until ``end``, shape (ticks, nv)."""
     after = series.v[series.slice(window.begin, end)]
-    if not setup.scenario.push:
-        after = after - series.v[before(series, window)]
-    return float(np.linalg.norm(after, axis=1).max(initial=0.0))
+    return after if setup.scenario.push else after - series.v[before(series, window)]
+
+
+def _largest(change: Array) -> float:
+    return float(np.linalg.norm(change, axis=1).max(initial=0.0))

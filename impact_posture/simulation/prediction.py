@@ -7,13 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from impact_posture.dynamics.numeric import Numeric
+from impact_posture.impact.evaluation.impact_effect import ImpactLoad, impact_effect
+from impact_posture.impact.friction.coulomb_impact import coulomb_impact
 from impact_posture.impact.impact_contact import point_on
-from impact_posture.impact.kinds.kinds_by_name import KINDS
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
-from impact_posture.simulation.metrics import before, jump
+from impact_posture.simulation.metrics import before, impact_load
 from impact_posture.simulation.run import Run
 from impact_posture.simulation.setup import Setup
-from impact_posture.simulation.world.throw import thrown_jumps
+from impact_posture.simulation.world.throw import thrown_impulses, thrown_jumps
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,9 @@ class Prediction:
         measured: Measured jump (``peak_jump`` in :class:`~impact_posture.simulation.metrics.Metrics`).
         ratio: ``measured`` divided by ``coulomb`` (for pushes, by ``frictionless``); ``None`` if the divisor is
             almost zero.
+        predicted_impact: Effects on base, joints and contact that belong to ``coulomb``, for pushes to
+            ``frictionless``.  The peak force is only known for pushes.
+        measured_impact: Measured effects on base, joints and contact.
     """
 
     contact: int
@@ -50,6 +54,8 @@ class Prediction:
     coulomb: float | None
     measured: float
     ratio: float | None
+    predicted_impact: ImpactLoad
+    measured_impact: ImpactLoad
 
 
 def predict(setup: Setup, objective: WorstCaseObjective, run: Run) -> tuple[Prediction, ...]:
@@ -63,20 +69,29 @@ def predict(setup: Setup, objective: WorstCaseObjective, run: Run) -> tuple[Pred
         k = before(run.series, window)
         q, v = run.series.q[k], run.series.v[k]
         here = objective.oracle.quantities(q)
+        sticking, force = None, None
         if scenario.push:
-            approach = float(np.linalg.norm(scenario.push.force)) * scenario.push.duration
-            smooth, sticking, coulomb = approach * float(np.sqrt(here.H)), None, None
+            force = float(np.linalg.norm(scenario.push.force))
+            impulse = approach = force * scenario.push.duration
+            velocity = approach * here.jump
+            smooth, coulomb = approach * float(np.sqrt(here.H)), None
         elif scenario.throw:
             approach = scenario.throw.speed - float(scenario.normal @ numeric.at(q).jacobian(point)[:3] @ v)
             smooth, sticking, coulomb = thrown_jumps(objective.oracle, q, scenario.throw, approach)
+            pushed = thrown_impulses(objective.oracle, q, scenario.throw, approach)[-1]
+            velocity, impulse = objective.oracle.solve(objective.oracle.J.T @ pushed), float(here.normal @ pushed)
         else:
             approach = float(-scenario.normal @ numeric.at(q).jacobian(point)[:3] @ v)
             smooth = approach * float(np.sqrt(here.V))
             sticking = None if here.S is None else approach * float(np.sqrt(here.S))
-            coulomb = approach * float(np.sqrt(KINDS["coulomb"](objective.oracle).value(q)))
-        measured = jump(setup, run.series, window)
+            impact = coulomb_impact(objective.oracle, q)
+            velocity, impulse = approach * impact.jump, approach * impact.mass
+            coulomb = approach * float(np.sqrt(impact.jump @ objective.oracle.weigh(impact.jump)))
         expected = smooth if coulomb is None else coulomb
-        ratio = measured / expected if expected > 1e-9 else None
-        jumps = smooth, sticking, coulomb, measured
-        predictions.append(Prediction(window.contact, here.H, here.G, here.V, here.S, approach, *jumps, ratio))
+        effect, measured = impact_effect(setup.robot, velocity), impact_load(setup, run.series, window)
+        predicted = ImpactLoad(effect.base_linear, effect.base_angular, effect.joint, impulse, force, expected)
+        ratio = measured.jump / expected if expected > 1e-9 else None
+        jumps = smooth, sticking, coulomb, measured.jump
+        rigid = here.H, here.G, here.V, here.S
+        predictions.append(Prediction(window.contact, *rigid, approach, *jumps, ratio, predicted, measured))
     return tuple(predictions)

@@ -91,10 +91,12 @@ class Recorder:
         command, level, status, distance = (np.concatenate(parts) for parts in zip(*self._columns, strict=True))
         t, q, (pushed, begin, end) = trace.t, trace.q, self._push
         if self._shape is not None:
-            force, peak, slip = (x[:, self._shape] for x in (trace.force, trace.peak, trace.slip))
+            columns = trace.force, trace.peak, trace.impulse, trace.slip
+            force, peak, impulse, slip = (x[:, self._shape] for x in columns)
         else:
             force = pushed * ((begin < t) & (t <= end + 1e-9))[:, None]
             peak, slip = np.linalg.norm(force, axis=1), trace.slip.max(axis=1, initial=0.0)
+            impulse = pushed * np.clip(t - begin, 0.0, max(end - begin, 0.0))[:, None]
         stopped, names = np.zeros(trace.v.shape, dtype=bool), self._setup.robot.tangent_names
         for name, column in zip(self._world.stops.names, trace.stopped.T, strict=True):
             if name in names:
@@ -102,8 +104,9 @@ class Recorder:
         objective = np.full(t.size, np.nan)
         objective[::_EVERY] = [self._value(posture) for posture in q[::_EVERY]]
         return Series(
-            t, q, trace.v, trace.torques, np.clip(command, *self._rotors), trace.rotor_speeds, force, peak, slip,
-            trace.touching.sum(axis=1), trace.touching[:, self._feet], objective, level, status, stopped, distance,
+            t, q, trace.v, trace.torques, np.clip(command, *self._rotors), trace.rotor_speeds, force, peak, impulse,
+            slip, trace.touching.sum(axis=1), trace.touching[:, self._feet], objective, level, status, stopped,
+            distance,
         )  # fmt: skip
 
     def _trace(self) -> Trace:

@@ -58,6 +58,7 @@ class Series:
         rotor_speed: True rotor speeds, shape (n, rotors).
         force: Force on the shape of the task, or force of the push, world, N, shape (n, 3).
         peak: Largest normal force on the shape of the task within the tick, N, shape (n,).
+        impulse: Impulse of this force since the start, world, N·s, shape (n, 3); NaN in files of older versions.
         slip: Sliding speed of the shape of the task, or of the fastest foot for pushes, m/s, shape (n,).
         touching: Number of shapes in contact, shape (n,).
         feet: Whether each supporting foot is in contact, shape (n, feet).
@@ -76,6 +77,7 @@ class Series:
     rotor_speed: Array
     force: Array
     peak: Array
+    impulse: Array
     slip: Array
     touching: Array
     feet: Array
@@ -113,6 +115,7 @@ class Series:
         """
         try:
             arrays = read_arrays(path)
+            arrays.setdefault("impulse", np.full((len(arrays["t"]), 3), np.nan))
             columns = {f.name: arrays[f.name] for f in fields(Series)}
             if len({column.shape[0] for column in columns.values()}) != 1:
                 raise ValueError("columns of different lengths")

@@ -49,6 +49,16 @@ def test_simulate(aerial: Path, tmp_path: Path) -> None:
     for key in ("q_total_impact", "q_total_dwell", "peak_jump", "peak_force", "relaxed_ticks"):
         assert isinstance(result["metrics"][key], int | float)
     assert json.loads((tmp_path / "run" / "run.json").read_text()) == result
+    measured, predicted = (result["prediction"][key] for key in ("measured_impact", "predicted_impact"))
+    for key in ("base_linear", "base_angular", "joint", "impulse"):
+        assert measured[key] == result["metrics"][key] and type(predicted[key]) is type(measured[key])
+    assert 0.3 < measured["impulse"] / predicted["impulse"] < 3 and measured["joint"]["share"] > 0
+    assert start("report", "run", cwd=tmp_path).returncode == 0
+    page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
+    assert (
+        "rigid prediction" in page
+        and f"{measured['joint']['name']}: {measured['joint']['velocity']:.3g} rad/s" in page
+    )
     series = Series.load(tmp_path / "run" / "series.npz")
     window = result["windows"][0]
     speed = np.linalg.norm(series.v[series.slice(window["begin"], window["end"])], axis=1)
@@ -58,6 +68,17 @@ def test_simulate(aerial: Path, tmp_path: Path) -> None:
     refused = start("simulate", str(aerial), "--controller", "robust", "--out", "run", cwd=tmp_path)
     assert refused.returncode == 1 and "--force" in refused.stderr
     assert document(*command, "--force", cwd=tmp_path) == result
+    # Runs of older versions have neither impulses nor effects on base and joints.
+    (tmp_path / "old").mkdir()
+    older = json.loads(json.dumps(result))
+    for block in (older["prediction"], *(part["prediction"][0] for part in older["runs"])):
+        del block["measured_impact"], block["predicted_impact"]
+    for key in ("base_linear", "base_angular", "joint", "impulse"):
+        del older["metrics"][key]
+    (tmp_path / "old" / "run.json").write_text(json.dumps(older))
+    np.savez(tmp_path / "old" / "series.npz", **{k: column for k, column in vars(series).items() if k != "impulse"})
+    assert start("report", "old", cwd=tmp_path).returncode == 0
+    assert "rigid prediction" not in (tmp_path / "old" / "report.html").read_text(encoding="utf-8")
     # A time series whose time does not increase cannot be reported.
     columns = vars(series) | {"t": np.zeros_like(series.t)}
     Series(**columns).save(tmp_path / "run" / "series.npz")
@@ -89,6 +110,11 @@ def test_simulate_prints_a_summary(push: Path, tmp_path: Path) -> None:
     done = start("simulate", str(push), "--controller", "robust", "--mode", "held", "--format", "png", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     assert "solo8-push, robust:held" in done.stdout and "pushed after" in done.stdout
+    run = json.loads((tmp_path / "solo8-push-robust-held" / "run.json").read_text())
+    assert run["metrics"]["impulse"] == pytest.approx(6.5 * 0.4)
+    words = " ".join(done.stdout.split())
+    assert "measured rigid prediction" in words and "normal impulse 2.6 N·s 2.6 N·s" in words
+    assert f"{run['metrics']['joint']['name']} {run['metrics']['joint']['velocity']:.4g} rad/s, " in words
     assert max(len(line) for line in done.stdout.splitlines()) <= 80
     assert (tmp_path / "solo8-push-robust-held" / "series-minus.npz").is_file()
 
@@ -165,7 +191,7 @@ def test_simulate_prints_made_and_expected_contacts(capsys: pytest.CaptureFixtur
     numbers = {"relaxed_ticks": 7, "failed_ticks": 2, "contacts": 3, "contacts_asked": 5}
     event = {"status": "lost contact", "time": 1.25, "what": "2 of 5 contacts were never made", "sign": 1}
     result = {"scenario": "mine", "seed": 0, "status": "lost contact", "metrics": None, "events": [event],
-              "windows": [{"kind": "dwell"}], "runs": [{"ticks": 900, "metrics": numbers}],
+              "windows": [{"kind": "dwell"}], "runs": [{"ticks": 900, "metrics": numbers}], "prediction": None,
               "offline": None, "path": None, "warnings": []}  # fmt: skip
     _show(Page(), result, "nominal", Path("there"), [])
     text = " ".join(capsys.readouterr().out.split())
@@ -185,6 +211,7 @@ def test_compare(aerial: Path, tmp_path: Path) -> None:
     done = start("compare", str(aerial), "--controllers", "nominal,robust", "--seeds", "1", "--quiet", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     assert max(len(line) for line in done.stdout.splitlines()) <= 80
+    assert "worst joint, % of its limit" in done.stdout and "the impact itself is" in " ".join(done.stdout.split())
     assert not list(tmp_path.iterdir())
     options = "--controllers nominal,robust --seeds 2 --out both --format png".split()
     result = document("compare", str(aerial), *options, cwd=tmp_path)
@@ -193,6 +220,10 @@ def test_compare(aerial: Path, tmp_path: Path) -> None:
     assert nominal["samples"] == 2 and nominal["half_width"] > 0
     assert result["rows"][1]["reduction"]["mean"] == pytest.approx(1 - robust["mean"] / nominal["mean"], abs=0.05)
     assert json.loads((tmp_path / "both" / "comparison.json").read_text()) == result
+    for row in result["rows"]:
+        assert row["metrics"]["base_linear"]["samples"] == row["metrics"]["joint_share"]["samples"] == 2
+        assert row["approach"] > 0 and row["joint"]["share"] >= row["metrics"]["joint_share"]["mean"]
+        assert set(row["change"]) == set(row["metrics"])
     assert result["versions"] == versions_of_runs(tmp_path / "both")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["both"], "the store is removed"
     # The report shows both runs, read from the files of the folder.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,20 +24,25 @@ from impact_posture.experiment.reproduction import (
     missed_targets,
 )
 from impact_posture.experiment.reproduction_summary import advice, remarks, scenario_table, summary, table_one
-from impact_posture.experiment.seed_statistics import QUANTITIES, Interval, fate, row_of, without_noise
+from impact_posture.experiment.seed_statistics import QUANTITIES, Interval, fate, headline, row_of, without_noise
+from impact_posture.impact.evaluation.impact_effect import ImpactLoad, WorstJoint
 from impact_posture.simulation.controllers.controller_factory import CONTROLLERS, MEANING
 from impact_posture.simulation.metrics import Metrics
 from impact_posture.simulation.outcome import gravest
 from impact_posture.simulation.scenario_file import known_scenarios
 
-METRICS = Metrics(1.0, 0.5, 0.8, 2.0, 2.5, 3.0, 3.5, 3.0, 100.0, 0.1, 0.2, 0.05, 7, 0, 0.01, (), 5, 5)
+ELBOW = WorstJoint("elbow", 2.0, "rad/s", 0.4)
+METRICS = Metrics(
+    1.0, 0.5, 0.8, 2.0, 2.5, 3.0, 3.5, 3.0, 100.0, 0.1, 0.2, 0.05, 7, 0, 0.01, (), 5, 5,
+    base_linear=0.2, base_angular=1.0, joint=ELBOW, impulse=0.5,
+)  # fmt: skip
 
 
 def document(controller: str, seed: int, q: float, **changed: Any) -> dict[str, Any]:
-    values = {**METRICS.__dict__, "q_total_impact": q, "q_total_recovery": 2 * q, **changed}
-    prediction = {"H": 10.0 * q, "ratio": 1.2}
+    values = {**vars(METRICS), "q_total_impact": q, "q_total_recovery": 2 * q, **changed}
+    prediction = {"H": 10.0 * q, "ratio": 1.2, "coulomb": 2.5, "approach": 0.5}
     return {"scenario": "aerial-vertical", "controller": controller, "seed": seed, "status": "completed",
-            "events": [], "runs": [{"sign": 1}], "metrics": Metrics(**values).to_dict(),
+            "events": [], "runs": [{"sign": 1}], "metrics": jsonable(Metrics(**values).to_dict()),
             "prediction": prediction}  # fmt: skip
 
 
@@ -205,6 +211,65 @@ def test_metrics_of_both_signs() -> None:
     assert (both.q_total_impact, both.peak_jump_max, both.relaxed_ticks) == (2.0, 9.0, 14)
     assert both.stops == ("knee",) and not both.rested
     assert combined([METRICS]) is METRICS
+
+    wrist = WorstJoint("wrist", 1.0, "rad/s", 0.5)
+    pushed = replace(METRICS, base_linear=0.4, base_angular=3.0, joint=wrist, impulse=1.5, peak_force=150.0)
+    both = combined([METRICS, pushed])
+    assert both.load == ImpactLoad(pytest.approx(0.3), 2.0, wrist, 1.0, 150.0, 3.0)
+    fixed = combined([replace(METRICS, base_linear=None, base_angular=None)] * 2)
+    assert (fixed.base_linear, fixed.base_angular, fixed.joint) == (None, None, ELBOW)
+
+
+def compared(*, seeds: int = 4, noise: float = 0.0, **changed: Any) -> tuple[Any, Any]:
+    """Return the rows of a controller with changed metrics, and of nominal."""
+    wobble = [noise * (-1) ** k for k in range(seeds)]
+    joint = changed.pop("share", 0.4)
+    parts = [document("nominal", k, 2.0) for k in range(seeds)]
+    for k in range(seeds):
+        factors = {key: getattr(METRICS, key) * (factor + wobble[k]) for key, factor in changed.items()}
+        worst = replace(ELBOW, velocity=2.0 * joint / 0.4, share=joint)
+        parts.append(document("robust", k, 1.0, **factors, joint=worst))
+    nominal, row = gather("aerial-vertical", ["nominal", "robust"], parts)
+    return jsonable(row), jsonable(nominal)
+
+
+def test_the_headline_says_for_whom_the_impact_is_better() -> None:
+    row, nominal = compared(share=0.3, peak_jump=1.2, peak_force=2.0, base_linear=1.5)
+    assert headline(row, nominal) == (
+        "robust moves 50% less; peak jump +20%, peak force × 2; "
+        "the impact itself is better for the joints at the price of base and force"
+    )
+    assert headline(*compared(share=0.3, base_angular=1.02)).endswith("the impact itself is better")
+    assert headline(*compared(impulse=1.1)).endswith("the impact itself is worse")
+    # A change of 30 % within an interval of 57 % is not one, and the text says so.
+    doubtful = compared(base_linear=1.3, noise=0.5)
+    assert doubtful[0]["change"]["base_linear"]["half_width"] > 0.06
+    assert headline(*doubtful).endswith("the impact itself is no better beyond the intervals")
+    assert headline(*compared(base_linear=1.3, noise=0.5, seeds=2)).endswith("the impact itself is worse")
+    # A change of the base of less than 1 % of the approach speed (0.5 m/s) is negligible.
+    slight = compared(base_linear=1.07)
+    for part in slight:
+        part["metrics"]["base_linear"]["mean"] /= 10
+        part["change"]["base_linear"]["mean"] /= 10
+    assert headline(*slight).endswith("the impact itself is no better")
+    # Results of older versions have no impulse.
+    del row["change"]["impulse"]
+    assert headline(row, nominal) == "robust moves 50% less; peak jump +20%, peak force × 2"
+
+
+def test_the_worst_joint_of_a_row_is_the_worst_of_any_seed() -> None:
+    wrist = WorstJoint("wrist", 3.0, "rad/s", 0.6)
+    documents = [document("robust", 0, 1.0), document("robust", 1, 1.0, joint=wrist)]
+    row = row_of("aerial-vertical", "robust", documents, NOMINAL[:2])
+    assert row.joint == wrist and row.approach == pytest.approx(0.5)
+    assert row.metrics["joint_share"].mean == pytest.approx(0.5) and row.change["joint_velocity"].mean == 0.5
+    assert "wrist 2.5 rad/s, 50 %" in scenario_table([row])
+    # A fixed robot without velocity limits.
+    changed = {"base_linear": None, "base_angular": None, "joint": replace(ELBOW, share=None)}
+    bare = [document(name, 0, 1.0, **changed) for name in ("nominal", "robust")]
+    nominal, row = gather("aerial-vertical", ["nominal", "robust"], bare)
+    assert {*QUANTITIES} - {*row.metrics} == {"base_linear", "base_angular", "joint_share"}
+    assert "| elbow 2 rad/s |" in scenario_table([row]) and headline(jsonable(row), jsonable(nominal))
 
 
 def test_documents_have_no_infinities() -> None:

@@ -81,7 +81,7 @@ def by_hand(setup: Setup, n: int, period: float = 1e-3, begin: float = 0.0, **co
         "t": begin + period * np.arange(1, n + 1), "q": np.tile(setup.q, (n, 1)), "v": np.zeros((n, robot.nv)),
         "torque": np.zeros((n, joints)), "rotor_command": np.full((n, rotors), middle),
         "rotor_speed": np.full((n, rotors), middle), "force": np.zeros((n, 3)), "peak": np.zeros(n),
-        "slip": np.zeros(n), "touching": np.zeros(n, int),
+        "impulse": np.zeros((n, 3)), "slip": np.zeros(n), "touching": np.zeros(n, int),
         "feet": np.ones((n, len(feet_of(setup))), bool), "objective": np.full(n, np.nan), "level": np.zeros(n),
         "status": np.zeros(n, int), "at_stop": np.zeros((n, robot.nv), bool), "reference": np.zeros(n),
     }  # fmt: skip

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from impact_posture.errors import SpecError
-from impact_posture.simulation.metrics import JUMP, before, jump, measure
+from impact_posture.simulation.metrics import JUMP, before, impact_load, measure
 from impact_posture.simulation.recorder import STATUSES
 from impact_posture.simulation.run import Run
 from impact_posture.simulation.series import Series, Window
@@ -108,7 +108,7 @@ def test_the_jump_begins_at_the_last_tick_before_the_touch() -> None:
     series = by_hand(setup, 1000, v=v)
     # The first touch is in tick 200, which ends at 0.201 s, so tick 199 is the last tick before the touch.
     assert before(series, touch(0.2004)) == 199
-    assert jump(setup, series, touch(0.2004)) == pytest.approx(3 * 15)
+    assert impact_load(setup, series, touch(0.2004)).jump == pytest.approx(3 * 15)
     assert before(series, touch(0.0)) == 0
 
 
@@ -121,6 +121,48 @@ def test_mean_and_largest_jump_of_the_contacts() -> None:
     assert metrics.contacts == 2
     none = measured({"v": v}, touch(0.2, touched=False))
     assert (none.peak_jump, none.contacts) == (0.0, 0)
+
+
+def test_base_worst_joint_and_impulse_of_each_window() -> None:
+    setup = shared_factory("aerial-vertical").setup
+    limits, names = setup.robot.velocity_limits, setup.robot.tangent_names
+    generator = np.random.default_rng(5)
+    v = generator.normal(size=(1000, 9)) * np.where(np.isfinite(limits), limits, 1.0)
+    impulse = generator.normal(size=(1000, 3)).cumsum(axis=0)
+    windows = touch(0.2), touch(0.6, contact=1), touch(0.4, 0.1, contact=2, touched=False)
+    metrics = measured({"v": v, "impulse": impulse, "peak": np.arange(1000.0)}, *windows)
+    # Ticks end at 1, 2, … ms.  The last tick before the touch at 0.2 s has the index 199.
+    loads, series = [], by_hand(setup, 1000, v=v, impulse=impulse, peak=np.arange(1000.0))
+    for k, window in zip((199, 599), windows, strict=False):
+        change = v[k + 1 : k + 16] - v[k]
+        load = impact_load(setup, series, window)
+        assert load.base_linear == pytest.approx(np.linalg.norm(change[:, :3], axis=1).max())
+        assert load.base_angular == pytest.approx(np.linalg.norm(change[:, 3:6], axis=1).max())
+        largest = np.abs(change[:, 6:]).max(axis=0)
+        worst = int(np.argmax(largest / limits[6:]))
+        assert load.joint is not None and load.joint.name == names[6 + worst]
+        assert load.joint.velocity == pytest.approx(largest[worst])
+        assert load.joint.share == pytest.approx((largest / limits[6:]).max())
+        assert load.impulse == pytest.approx(abs(setup.scenario.normal @ (impulse[k + 15] - impulse[k])))
+        assert load.peak_force == k + 300
+        loads.append(load)
+    for name in ("base_linear", "base_angular", "impulse"):
+        assert getattr(metrics, name) == pytest.approx(np.mean([getattr(load, name) for load in loads])), name
+    assert metrics.joint == max((load.joint for load in loads if load.joint), key=lambda joint: joint.share or 0)
+    assert metrics.load.joint == metrics.joint and metrics.load.peak_force == 599 + 300
+    nothing = measured({"v": v}, touch(0.2, touched=False))
+    assert (nothing.base_linear, nothing.joint, nothing.impulse) == (None, None, 0.0)
+
+
+def test_a_fixed_robot_has_no_base() -> None:
+    setup = shared_factory("panda-tap").setup
+    v = np.zeros((1000, setup.robot.nv))
+    v[300:, 2] = 0.4
+    load = measure(setup, Run(by_hand(setup, 1000, v=v), (touch(0.2),))).load
+    assert (load.base_linear, load.base_angular, load.joint) == (None, None, load.joint)
+    quiet = impact_load(setup, by_hand(setup, 1000, v=v), touch(0.29))
+    assert load.joint is not None and load.joint.velocity == 0 and quiet.joint is not None
+    assert (quiet.joint.name, quiet.joint.velocity) == (setup.robot.tangent_names[2], 0.4)
 
 
 def test_saturation_inside_and_outside_the_windows() -> None:

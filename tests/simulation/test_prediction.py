@@ -124,6 +124,13 @@ def test_a_sliding_impact_jumps_as_predicted(friction: float) -> None:
     assert prediction.coulomb is not None and prediction.sticking is not None
     assert prediction.measured == pytest.approx((1 + e) * prediction.coulomb, rel=0.05)
     assert prediction.ratio == pytest.approx(prediction.measured / prediction.coulomb)
+    # Base, worst joint and normal impulse also grow by the rebound.
+    predicted, measured = prediction.predicted_impact, prediction.measured_impact
+    for name in ("base_linear", "base_angular", "impulse"):
+        assert getattr(measured, name) == pytest.approx((1 + e) * getattr(predicted, name), rel=0.05), name
+    assert measured.joint is not None and predicted.joint is not None and measured.joint.name == predicted.joint.name
+    assert measured.joint.share == pytest.approx((1 + e) * (predicted.joint.share or 0), rel=0.05)
+    assert (predicted.jump, measured.jump) == (prediction.coulomb, prediction.measured)
 
 
 def test_the_peak_jump_is_the_jump_of_the_impact() -> None:
@@ -133,6 +140,13 @@ def test_the_peak_jump_is_the_jump_of_the_impact() -> None:
     k = before(run.series, run.windows[0])
     ahead = run.series.v[k + 1 : k + 1 + round(JUMP / 1e-3)] - run.series.v[k]
     assert metrics.peak_jump == pytest.approx(np.linalg.norm(ahead, axis=1).max())
+    # Nothing else acts on the drifting robot, so the impulse is the change of its momentum.
+    model, momentum = setup.robot.model, []
+    for at in (k, k + round(JUMP / 1e-3)):
+        data = model.createData()
+        pin.centerOfMass(model, data, run.series.q[at], run.series.v[at])
+        momentum.append(data.mass[0] * data.vcom[0] @ setup.scenario.normal)
+    assert metrics.impulse == pytest.approx(momentum[1] - momentum[0], rel=1e-3) and metrics.impulse > 0.1
     assert not run.series.touching[:k].any() and run.series.touching.any()
     assert np.isnan(run.series.objective[1]) and run.series.objective[0] == pytest.approx(prediction.H, rel=1e-2)
 
@@ -145,3 +159,9 @@ def test_the_prediction_of_a_push_follows_from_its_impulse() -> None:
     assert prediction.frictionless == pytest.approx(6.5 * 0.2 * np.sqrt(prediction.H))
     assert prediction.H == pytest.approx(factory.objective().value(factory.setup.q), rel=0.02)
     assert prediction.ratio == pytest.approx(prediction.measured / prediction.frictionless)
+    assert prediction.predicted_impact.impulse == pytest.approx(6.5 * 0.2)
+    assert prediction.measured_impact.impulse == pytest.approx(6.5 * 0.2)
+    assert prediction.predicted_impact.peak_force == prediction.measured_impact.peak_force == pytest.approx(6.5)
+    q = run.series.q[before(run.series, run.windows[0])]
+    velocity = prediction.approach * factory.objective().oracle.quantities(q).jump
+    assert prediction.predicted_impact.base_linear == pytest.approx(np.linalg.norm(velocity[:3]))

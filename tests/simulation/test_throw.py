@@ -121,6 +121,10 @@ def test_a_standing_robot_jumps_as_predicted() -> None:
     # The ball rebounds with restitution 0.13, and the controller acts during the contact of 15 ms.
     assert impact.coulomb is not None
     assert 0.95 < metrics.peak_jump / impact.coulomb < 1.25
+    assert 0.95 < metrics.impulse / impact.predicted_impact.impulse < 1.25
+    assert (
+        impact.predicted_impact.jump == pytest.approx(impact.coulomb) and impact.predicted_impact.peak_force is None
+    )
     assert metrics.peak_force > 10
     window = record.of("impact")[0]
     assert window.begin == pytest.approx(record.waited) and window.end - window.begin == pytest.approx(0.3)

@@ -218,7 +218,7 @@ def make_record(scenario: str, number: int, of: dict[str, tuple[float, float] | 
         )  # fmt: skip
         H, S = (more.get(f"{key}_{name}", 4.0) for key in "HS")
         jumps = {"frictionless": 1.0, "sticking": S, "coulomb": S}
-        prediction = {"H": H, "ratio": 1.0, "impacts": 5, **jumps}
+        prediction = {"H": H, "ratio": 1.0, "impacts": 5, "approach": 1.0, **jumps}
         documents[name] = document | {
             "status": "completed", "metrics": jsonable(metrics.to_dict()), "prediction": prediction,
         }  # fmt: skip

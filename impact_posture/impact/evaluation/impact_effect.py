@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,6 +54,24 @@ class ImpactEffect:
         return json_block(self)
 
 
+@dataclass(frozen=True)
+class ImpactLoad(ImpactEffect):
+    """Effects of an impact on base, joints and contact, as predicted or as measured.
+
+    Attributes:
+        base_linear: Linear velocity jump of a floating base, m/s; ``None`` for a fixed base.
+        base_angular: Angular velocity jump of a floating base, rad/s; ``None`` for a fixed base.
+        joint: Joint with the largest ratio of velocity jump to velocity limit; ``None`` if there are no joints.
+        impulse: Normal impulse at the first contact, N·s.
+        peak_force: Largest normal force, N; ``None`` if it is unknown, or for several contacts.
+        jump: Norm ``‖Δν‖_W`` of the jump of base and joints.
+    """
+
+    impulse: float
+    peak_force: float | None
+    jump: float
+
+
 def tangent_units(robot: Robot) -> tuple[str, ...]:
     """Return ``m/s`` or ``rad/s`` for each of the nv velocity entries."""
     units: list[str] = []
@@ -63,9 +82,13 @@ def tangent_units(robot: Robot) -> tuple[str, ...]:
 
 
 def impact_effect(robot: Robot, velocity: Array) -> ImpactEffect:
-    """Return base and worst joint of the velocity jump ``velocity``, shape (nv,)."""
-    linear, angular = (float(np.linalg.norm(velocity[part])) for part in (slice(3), slice(3, 6)))
-    joint = _worst_joint(robot, np.abs(velocity))
+    """Return base and worst joint of the velocity jump ``velocity``, shape (nv,).
+
+    For several velocity jumps, shape (n, nv), return the largest sizes of each part.
+    """
+    jumps = np.atleast_2d(velocity)
+    linear, angular = (float(np.linalg.norm(jumps[:, part], axis=1).max()) for part in (slice(3), slice(3, 6)))
+    joint = _worst_joint(robot, np.abs(jumps).max(axis=0))
     return ImpactEffect(linear, angular, joint) if robot.floating else ImpactEffect(None, None, joint)
 
 
@@ -81,3 +104,27 @@ def _worst_joint(robot: Robot, sizes: Array) -> WorstJoint | None:
     k = int(compared[np.argmax((sizes / limits if limited.size else sizes)[compared])])
     share = float(sizes[k] / limits[k]) if limited.size else None
     return WorstJoint(robot.tangent_names[k], float(sizes[k]), units[k], share)
+
+
+def mean_load(loads: Sequence[ImpactLoad]) -> ImpactLoad:
+    """Return base, impulse and jump averaged over one or more impacts, and the worst joint and peak force of any."""
+
+    def mean(values: Sequence[float | None]) -> float | None:
+        known = [value for value in values if value is not None]
+        return float(np.mean(known)) if len(known) == len(values) else None
+
+    forces = [load.peak_force for load in loads if load.peak_force is not None]
+    return ImpactLoad(
+        mean([load.base_linear for load in loads]),
+        mean([load.base_angular for load in loads]),
+        worst_joint([load.joint for load in loads]),
+        float(np.mean([load.impulse for load in loads])),
+        max(forces) if len(forces) == len(loads) else None,
+        float(np.mean([load.jump for load in loads])),
+    )
+
+
+def worst_joint(joints: Sequence[WorstJoint | None]) -> WorstJoint | None:
+    """Return the worst joint of several impacts: the largest share, or the largest jump if no joint has a limit."""
+    known = [joint for joint in joints if joint is not None]
+    return max(known, key=lambda joint: joint.velocity if joint.share is None else joint.share, default=None)

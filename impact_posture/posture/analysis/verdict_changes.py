@@ -6,8 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
-from impact_posture.config.json_block import json_block
-from impact_posture.impact.evaluation.impact_effect import WorstJoint
+from impact_posture.impact.evaluation.impact_effect import ImpactLoad
 
 Side = Literal["base", "joints", "impulse", "force"]
 
@@ -18,30 +17,16 @@ _FELT = 0.01
 
 
 @dataclass(frozen=True)
-class PredictedImpact:
+class PredictedImpact(ImpactLoad):
     """The predicted impact in one posture, for the approach speed and the friction of the problem.
 
+    The peak force is ``None`` if no contact stiffness is given.
+
     Attributes:
-        base_linear: Linear velocity jump of a floating base, m/s; ``None`` for a fixed base.
-        base_angular: Angular velocity jump of a floating base, rad/s; ``None`` for a fixed base.
-        joint: Joint with the largest ratio of velocity jump to velocity limit; ``None`` if there are no joints.
-        impulse: Normal impulse at the first contact, N·s.
-        peak_force: Largest normal force, N; ``None`` if no contact stiffness is given, or for several contacts.
-        jump: Norm ``‖Δν‖_W`` of the jump of base and joints.
         sticks: Whether the first contact point sticks; ``None`` if the jump was computed without friction.
     """
 
-    base_linear: float | None
-    base_angular: float | None
-    joint: WorstJoint | None
-    impulse: float
-    peak_force: float | None
-    jump: float
     sticks: bool | None
-
-    def to_dict(self) -> dict[str, object]:
-        """Return JSON content."""
-        return json_block(self)
 
 
 @dataclass(frozen=True)
@@ -72,16 +57,16 @@ class Change:
 
 
 def changes(
-    before: PredictedImpact, after: PredictedImpact, speed: float, force: float | None, where: str = ""
+    before: ImpactLoad, after: ImpactLoad, speed: float, force: float | None, where: str = ""
 ) -> tuple[Change, ...]:
-    """Return the changes from one posture to another; ``force`` is the relative change of the peak force.
+    """Return the changes from one impact to another; ``force`` is the relative change of the peak force.
 
     ``speed`` is the approach speed, m/s, and ``where`` names the contact of the impulse if there are several.
     """
     return (*_velocities(before, after, _FELT * speed), *_contact(before, after, force, where))
 
 
-def _velocities(before: PredictedImpact, after: PredictedImpact, least: float) -> Iterator[Change]:
+def _velocities(before: ImpactLoad, after: ImpactLoad, least: float) -> Iterator[Change]:
     bases = (("m/s", before.base_linear, after.base_linear), ("rad/s", before.base_angular, after.base_angular))
     for unit, first, last in bases:
         if first is not None and last is not None:
@@ -103,7 +88,7 @@ def _velocities(before: PredictedImpact, after: PredictedImpact, least: float) -
     )
 
 
-def _contact(before: PredictedImpact, after: PredictedImpact, force: float | None, where: str) -> Iterator[Change]:
+def _contact(before: ImpactLoad, after: ImpactLoad, force: float | None, where: str) -> Iterator[Change]:
     impulse = relative_change(before.impulse, after.impulse)
     seconds = f"{before.impulse:.3g} to {after.impulse:.3g} N·s"
     yield Change("impulse", impulse, f"normal impulse{where} {seconds} ({_sign(impulse)})")

@@ -74,8 +74,8 @@ class Throw(ContactLaw, Settling):
     window: Positive = 0.3
 
 
-def thrown_jumps(oracle: ImpactOracle, q: Array, throw: Throw, speed: float) -> tuple[float, float, float]:
-    """Return the robot's velocity jumps ``‖Δν‖`` without friction, for a sticking ball, and with the ball's friction.
+def thrown_impulses(oracle: ImpactOracle, q: Array, throw: Throw, speed: float) -> tuple[Array, Array, Array]:
+    """Return the impulses of the ball without friction, for a sticking ball, and with its friction, shapes (3,).
 
     The mobility at the contact is ``B + D``.  ``B = J M⁻¹Jᵀ`` is the mobility of the robot.  The mobility ``D`` of
     the ball is ``1/m`` along the normal and ``3.5/m`` in the tangent plane.  Without rebound, the impulse is
@@ -84,7 +84,7 @@ def thrown_jumps(oracle: ImpactOracle, q: Array, throw: Throw, speed: float) -> 
     ``n`` is the normal of the oracle, which is the direction of flight.
     """
     quantities = oracle.quantities(q)
-    n, jump_per_impulse = quantities.normal, oracle.solve(oracle.J.T)
+    n = quantities.normal
     across = np.eye(3) - np.outer(n, n)
     mobility = quantities.mobility + (np.outer(n, n) + _SPIN * across) / throw.mass
     frictionless, sticking = n / float(n @ mobility @ n), np.linalg.solve(mobility, n)
@@ -93,8 +93,14 @@ def thrown_jumps(oracle: ImpactOracle, q: Array, throw: Throw, speed: float) -> 
     if drag > throw.friction * normal:
         direction = n + throw.friction * tangent / drag
         coulomb = direction / float(n @ mobility @ direction)
-    impulses = (frictionless, sticking, coulomb)
-    a, b, c = (speed * float(np.linalg.norm(jump_per_impulse @ impulse)) for impulse in impulses)
+    a, b, c = (np.asarray(speed * impulse, dtype=float) for impulse in (frictionless, sticking, coulomb))
+    return a, b, c
+
+
+def thrown_jumps(oracle: ImpactOracle, q: Array, throw: Throw, speed: float) -> tuple[float, float, float]:
+    """Return the robot's velocity jumps ``‖Δν‖`` under each of :func:`thrown_impulses`."""
+    impulses = thrown_impulses(oracle, q, throw, speed)
+    a, b, c = (float(np.linalg.norm(oracle.solve(oracle.J.T @ impulse))) for impulse in impulses)
     return a, b, c
 
 
