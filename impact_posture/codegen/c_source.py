@@ -110,7 +110,7 @@ def _generate(
         functions.append({
             "stem": function.stem,
             "name": function.name,
-            # The objective of several contacts at once has the normal of the leading contact.
+            # The template variables of an objective of several contacts contain the normal of its first contact.
             "normal": None if "n" in inputs else contacts.get(function.stem, single[0].objective.contact).normal,
             "calls": [text.call for block, text in blocks if number in block.functions],
             "outputs": [*_outputs(function, emitter, "m.")],

@@ -48,8 +48,8 @@ class ActuatorLimits:
         """Return the largest ``λ ≥ 0`` for which the limits allow the load ``rest + λ dynamic``, or infinity.
 
         A motion of duration ``T`` has the load of gravity plus ``1/T²`` times the dynamic load for ``T = 1 s``.  So
-        the result is ``1/T²`` of the fastest motion.  Return ``None`` if the limits do not even allow the load at
-        rest.
+        the result is ``1/T²``, where ``T`` is the duration of the fastest motion.  Return ``None`` if the limits do
+        not even allow the load at rest.
         """
         if self._out_of_reach(rest):
             return None

@@ -105,7 +105,7 @@ class WalkerDriver(RobustDriver):
         return command
 
     def tick(self, reading: Reading, reference: ReferencePoint | None = None) -> Command:
-        """Return the command.  Update the basis ``Z`` as often as the gradient."""
+        """Return the command.  Update the basis ``Z`` in the ticks that update the gradient."""
         if self.level > 0:
             if self._ticks % self.posture.every == 0:
                 self.posture.basis = self.controller.assembly.redundancy(self.controller.state)
