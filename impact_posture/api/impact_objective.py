@@ -16,6 +16,7 @@ from impact_posture.config.problem_settings import (
     RESTITUTION,
     SPEED,
     ContactPoint,
+    ImpactSettings,
     JointModel,
     MetricKind,
     ObjectiveKind,
@@ -25,7 +26,7 @@ from impact_posture.impact.contact_point import at_front
 from impact_posture.impact.evaluation.evaluation import Evaluation, evaluate
 from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.impact.metric import Metric, build_metric, check_weights
-from impact_posture.impact.resolved_impact import held_by_default, missing_support
+from impact_posture.impact.resolved_impact import choose_objective, held_by_default, missing_support
 from impact_posture.impact.support_compliance import check_compliance
 from impact_posture.impact.supports import refuse_held, refuse_rigid, resolve_supports
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
@@ -52,7 +53,9 @@ class ImpactObjective(WorstCaseObjective):
         metric: Norm of the velocity jump: ``euclidean``, ``kinetic`` or ``weighted``, or a
             :class:`~impact_posture.impact.metric.Metric`.
         kind: Minimized quantity: ``impulse`` (λ̄²H), ``speed`` (V), ``sticking`` (S), ``coulomb`` (C) or ``energy``
-            (E), as in ``docs/notation.md``.
+            (E), as in ``docs/notation.md``.  ``None`` selects ``impulse``.  But if the contact states its friction,
+            ``None`` selects the same quantity as ``--objective auto`` on the command line.  A
+            :class:`PostureProblem` that states the speed or the elasticity of the contact also does this.
         supports: Feet that stay in place during the impact, as ``FRAME[:point|surface]``; ``None`` selects the feet
             of robot.toml, ``()`` selects no feet.
         compliance: Compliance ε of the supports, 1/kg; 0 selects 1e-4 divided by the mass of the robot.
@@ -81,7 +84,7 @@ class ImpactObjective(WorstCaseObjective):
         robot: Robot,
         contact: ImpactContact | Sequence[ImpactContact],
         metric: MetricKind | Metric = "euclidean",
-        kind: ObjectiveKind = "impulse",
+        kind: ObjectiveKind | None = None,
         supports: Sequence[str | Support] | None = None,
         compliance: NonNegative = 0.0,
         normal_cone_deg: HalfAngle = 0.0,
@@ -119,9 +122,15 @@ class ImpactObjective(WorstCaseObjective):
             check_compliance(robot, compliance)
         loads = [Payload(*payload) for payload in payloads]
         variants = tuple(model_variants) or build_model_variants(robot, armature_range, loads)
-        super().__init__(
-            robot, leading, metric, kind, feet, compliance, normal_cone_deg, tuple(more), bilateral, variants
+        settings = ImpactSettings(
+            robot=robot.source, objective=kind, friction=leading.friction, normal_cone=normal_cone_deg
         )
+        chosen, _ = choose_objective(settings, several=bool(more))
+        super().__init__(
+            robot, leading, metric, chosen, feet, compliance, normal_cone_deg, tuple(more), bilateral, variants
+        )
+        # PostureProblem chooses again, because it may state the speed.
+        object.__setattr__(self, "_stated_kind", kind)
         # A missing support is not an error, because an impact can be evaluated without supports.
         object.__setattr__(self, "_missing", missing_support(robot) if supports is None and not feet else "")
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from impact_posture.config.table_validation import validate
 from impact_posture.errors import InputError
 from impact_posture.impact.elasticity.contact_compression import ContactStiffness
 from impact_posture.impact.objective import Objective
-from impact_posture.impact.resolved_impact import ResolvedImpact
+from impact_posture.impact.resolved_impact import ResolvedImpact, choose_objective
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.posture.formulation.build_problem import build_problem
 from impact_posture.posture.formulation.problem_file import Prepared, prepare, requirements
@@ -33,7 +33,9 @@ class PostureProblem:
 
     Args:
         objective: An :class:`ImpactObjective`, or another implementation of
-            :class:`~impact_posture.impact.objective.Objective`.
+            :class:`~impact_posture.impact.objective.Objective`.  If the objective has no ``kind`` and the speed, the
+            friction or the elasticity of the contact is stated, the minimized quantity is chosen as by
+            ``--objective auto`` on the command line.
         posture: Start of the search: the name of a posture, a file, or a configuration of shape (nq,); ``None``
             selects the default posture.
         speed: Approach speed of the predicted impact, m/s.
@@ -69,7 +71,10 @@ class PostureProblem:
         if stated(speed):
             values["speed"] = speed
         if isinstance(objective, WorstCaseObjective):
-            values["friction"] = objective.contact.friction
+            values |= {"objective": getattr(objective, "_stated_kind", objective.kind)}
+            values |= {"normal_cone": objective.normal_cone_deg}
+            if stated(objective.contact.friction):
+                values["friction"] = objective.contact.friction
         for name in _OF_THE_OBJECTIVE & set(task):
             fault = "belongs to the objective"
             raise InputError(fault, where=name, hint="give it to ImpactObjective or ImpactContact")
@@ -78,7 +83,9 @@ class PostureProblem:
         if isinstance(objective, WorstCaseObjective):
             missing = getattr(objective, "_missing", "")
             contact = ContactStiffness.of(settings.contact_stiffness, settings.contact_duration)
-            impact = ResolvedImpact(objective, q, name, speed, restitution, missing, contact)
+            kind, choice = choose_objective(settings, several=bool(objective.others))
+            chosen = objective if kind == objective.kind else replace(objective, kind=kind)
+            impact = ResolvedImpact(chosen, q, name, speed, restitution, missing, contact, choice)
             self.prepared = prepare(settings, impact)
             self.problem: ConstrainedProblem = self.prepared.problem
         else:

@@ -60,7 +60,7 @@ def resolve(settings: ImpactSettings, robot: Robot | None = None) -> ResolvedImp
     compliance = settings.support_compliance
     if compliance is not None:
         check_compliance(robot, compliance)
-    kind, choice = _choose(settings, several=bool(others))
+    kind, choice = choose_objective(settings, several=bool(others))
     objective = WorstCaseObjective(
         robot,
         leading,
@@ -85,7 +85,7 @@ def held_by_default(robot: Robot) -> tuple[str, ...]:
     return tuple(joint for joint in robot.spec.constraints.hold if joint not in robot.locked)
 
 
-def _choose(settings: ImpactSettings, *, several: bool) -> tuple[ObjectiveKind, str]:
+def choose_objective(settings: ImpactSettings, *, several: bool) -> tuple[ObjectiveKind, str]:
     """Return the objective type, and the reason if it is chosen automatically (otherwise empty)."""
     stated = [name for name in _CHOOSING if is_stated(getattr(settings, name))]
     if settings.objective is None and not stated:

@@ -98,6 +98,36 @@ def test_defaults_agree_with_the_command_line(
     assert np.array_equal(ours.problem.given, theirs.problem.given)
 
 
+@pytest.mark.parametrize(
+    ("stated", "kind"),
+    [
+        ({}, "impulse"),
+        ({"speed": 1.0}, "coulomb"),
+        ({"speed": 0.0}, "impulse"),
+        ({"friction": 0.3}, "coulomb"),
+        ({"friction": 0.0}, "speed"),
+        ({"contact_stiffness": "wood"}, "coulomb"),
+        ({"contact_duration": 0.01, "friction": 0.0}, "speed"),
+        ({"speed": 2.0, "normal_cone": 5.0}, "sticking"),
+        ({"speed": 2.0, "objective": "impulse"}, "impulse"),
+        ({"friction": 0.3, "objective": "energy"}, "energy"),
+    ],
+)
+def test_a_stated_speed_selects_the_objective_as_on_the_command_line(stated: dict[str, Any], kind: str) -> None:
+    theirs = prepare(make_settings({"robot": "ur5", "frame": "tool0", "normal": (0.1, 0.2, 1.0)} | stated)).impact
+    task = {key: value for key, value in stated.items() if key in ("speed", "contact_stiffness", "contact_duration")}
+    friction = {key: stated[key] for key in ("friction",) if key in stated}
+    contact = ip.ImpactContact("tool0", (0.1, 0.2, 1.0), **friction)
+    cone = stated.get("normal_cone", 0.0)
+    objective = ip.ImpactObjective(ip.load_robot("ur5"), contact, kind=stated.get("objective"), normal_cone_deg=cone)
+    problem = ip.PostureProblem(objective, **task)
+    assert problem.prepared is not None
+    ours = problem.prepared.impact
+    assert problem.problem.objective.name == ours.objective.kind == theirs.objective.kind == kind
+    assert (ours.choice, ours.to_dict()) == (theirs.choice, theirs.to_dict())
+    assert problem.problem.requirements == prepare(problem.prepared.settings, theirs).problem.requirements
+
+
 def test_a_robot_that_floats_without_anything_to_hold_it_is_refused() -> None:
     robot = ip.load_robot("example-robot-data:b1_description/urdf/b1-z1.urdf", root="free-flyer")
     contact = ip.ImpactContact("link06", (0, 0, 1))
