@@ -120,7 +120,7 @@ def test_the_time_above_which_the_weight_holds_the_feet() -> None:
     objective, q = hit("solo12", np.array([1.0, 0.0, 0.0]), 0.7)
     feet = StandingFeet(objective.oracle, objective.supports, q, 0.7)
     time = longest_lifting_time(feet, [objective.oracle], 1.0)
-    before = unilateral_impact(feet, [objective.oracle], 1.0, 0.6 * time)
+    before = unilateral_impact(feet, [objective.oracle], 1.0, 0.9 * time)
     after = unilateral_impact(feet, [objective.oracle], 1.0, time)
     assert before is not None and after is not None
     assert before.lifts or before.slides

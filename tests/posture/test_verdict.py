@@ -179,6 +179,28 @@ def test_the_weight_counts_if_the_contact_is_stated() -> None:
     assert "with the weight over the 0.1 ms of the contact" in brief.standing.fact
 
 
+def test_feet_that_hardly_move_count_if_the_base_feels_them() -> None:
+    """The soles of icub tip at less than 1 % of the approach speed, and the base turns more than twice as fast."""
+    wall: dict[str, object] = {"robot": "icub", "normal": (-1.0, 0.0, 0.0), "friction": 0.0}
+    impact = resolve(make_settings(wall | {"contact_stiffness": 1e6}))
+    evaluation = impact.evaluate()
+    told = verdict(impact, evaluation, evaluation)
+    assert evaluation.standing is not None and not evaluation.standing.moves
+    assert told.before is not None and told.unilateral is not None and "With feet that lift or slide" in told.line
+    held, free = told.before.base_angular, told.unilateral[0].base_angular
+    assert held is not None and free is not None and free > 2 * held
+    assert told.unilateral[0].peak_force is not None and told.to_dict()["unilateral"]
+
+
+def test_in_a_long_contact_the_robot_moves() -> None:
+    """The surface moves 15 mm within 30 ms at 0.5 m/s."""
+    for duration, long in ((29e-3, False), (31e-3, True)):
+        impact = resolved("panda", speed=0.5, contact_duration=duration)
+        told = verdict(impact, impact.evaluate(), impact.evaluate())
+        assert ("contact time" in [condition.key for condition in told.conditions]) == long
+        assert ("the robot moves during the 31 ms of the contact" in told.line) == long
+
+
 def test_a_posture_against_itself() -> None:
     impact = resolved("panda")
     told = verdict(impact, impact.evaluate(), impact.evaluate())

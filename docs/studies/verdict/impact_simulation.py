@@ -67,8 +67,8 @@ class SimulatedImpact:
         force: Normal force at the greatest compression, which is the largest one, N.
         slip: Speed of the contact point across the normal, m/s.
         time: Time from touch to the greatest compression, s.
-        feet: Speed of each point of the feet, m/s, shape (feet,).
-        up: Upward velocity of each point of the feet, m/s, shape (feet,).
+        feet: Largest speed of each point of the feet during the contact, m/s, shape (feet,).
+        up: Upward velocity of each point of the feet at the end, m/s, shape (feet,).
         unsolved: Number of time steps whose conditions were not fulfilled.
         q: Posture, shape (nq,).
         work: Work of the surface, J.
@@ -136,6 +136,7 @@ class ImpactSimulation:
         q, v, p, depth = self.q, np.zeros(self.model.nv), np.zeros(3 * count), np.zeros(count)
         depth[1:] = self.carried[: count - 1] / k[1:]
         impulse, work, lost, unsolved, time = np.zeros(3), 0.0, 0.0, 0, 0.0
+        fastest = np.zeros(count - 1)
         M, J, feet = self._contacts(q, axes, count)
         X = _respond(M, feet, J.T)
         dt = min(_LONGEST, np.pi / 2 / np.sqrt(surface.stiffness * float(J[2] @ X[:, 2])) / _STEPS)
@@ -165,19 +166,19 @@ class ImpactSimulation:
             last, v = v, v + share * (free + X @ p - v)
             q = q if self.still else pin.integrate(self.model, q, share * dt * (last + v) / 2)
             time += share * dt
+            fastest = np.maximum(fastest, np.linalg.norm(end[3:].reshape(-1, 3), axis=1))
             if after[2] >= 0:
                 break
         else:
             raise RuntimeError("the contact does not reach its greatest compression")
-        standing = end[3:].reshape(-1, 3)
         return SimulatedImpact(
             jump=v,
             impulse=axes.T @ impulse,
             force=float(k[0] * depth[0]),
             slip=float(np.linalg.norm(end[:2])),
             time=time,
-            feet=np.linalg.norm(standing, axis=1),
-            up=standing[:, 2],
+            feet=fastest,
+            up=end[5::3],
             unsolved=unsolved,
             q=q,
             work=work,

@@ -1,9 +1,11 @@
-"""The page of the study of verdicts: the worst rows, then counts for each bar, then other robots."""
+"""The page of the study of verdicts: the numbers beyond their bar, then counts for each bar, then other robots."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from itertools import product
+
+import numpy as np
 
 from docs.studies.core import Request, cell, collected, table
 from docs.studies.verdict.study import (
@@ -14,11 +16,13 @@ from docs.studies.verdict.study import (
     STIFFNESSES,
     Case,
     Compared,
+    HoldingTime,
     Pair,
     Row,
     compare,
 )
 from impact_posture.errors import ImpactPostureError
+from impact_posture.posture.analysis.verdict_changes import FELT
 
 # Number → its name in the tables, and its largest allowed relative error.
 NUMBERS = {
@@ -29,11 +33,19 @@ NUMBERS = {
     "impulse": ("normal impulse", 0.05),
     "force": ("peak force", 0.10),
 }
+VELOCITIES = ("linear", "angular", "joint")
 # A change below this value has no sign.
 NO_CHANGE = 0.03
+# Largest relative error of the contact time from which on the feet stay, predicted and simulated up to 5 % each.
+HOLDING = 0.20
 SHOWN = 25
-_WORST = "case|friction|k, N/m|feet|number|posture|predicted|simulated|error|error, posture still|T, ms".split("|")
-_COUNTS = "number|bar|within|largest error|within, posture still|changes above 3 %|right sign".split("|")
+# Reasons why a number may be beyond its bar.
+NEGLIGIBLE, MOVES_LONG = "negligible", "robot moves"
+_WORST = "case|friction|k, N/m|feet|number|posture|predicted|simulated|error|error, posture still|T, ms|reason".split(
+    "|"
+)
+_COUNTS = "number|bar|within|negligible|robot moves|missed|largest error|changes above 3 %|right sign".split("|")
+_HOLDING = "case|friction|posture|predicted, ms|simulated, ms|error|error, posture still|reason".split("|")
 _CASES = ("case", "rows", *(name for name, _ in NUMBERS.values()))
 
 
@@ -57,16 +69,17 @@ def _group(cases: Sequence[Case], request: Request) -> Iterator[str]:
             return compare(*tasks[index], request.count)
         except ImpactPostureError as error:
             case, friction = tasks[index]
-            return Compared((), (f"{case.name}, friction {friction:g}: {str(error).splitlines()[0]}",))
+            return Compared((), (), (f"{case.name}, friction {friction:g}: {str(error).splitlines()[0]}",))
 
     results = collected(work, len(tasks), request.jobs, "verdicts")
     rows = [row for result in results for row in result.rows]
-    yield from _worst(rows)
+    yield from _beyond(rows)
     for feet, words in (("–", "Robots without feet"), ("held", "Feet that are held"), ("free", "Feet that are free")):
         some = [row for row in rows if row.feet == feet]
         if some:
             yield from ("", f"{words}, {len(some)} verdicts:", "")
             yield from _counts(some, request)
+    yield from _holding([time for result in results for time in result.held], request)
     yield from ("", "Largest error of each case, in percent:", "")
     yield from table(_CASES, [_case(case, [row for row in rows if row.case == case]) for case in cases])
     missing = [reason for result in results for reason in result.missing]
@@ -78,26 +91,38 @@ def _pairs(rows: Sequence[Row]) -> list[tuple[Row, str, Pair]]:
     return [(row, name, getattr(row, name)) for row in rows for name in ("before", "after")]
 
 
-def _worst(rows: Sequence[Row]) -> Iterator[str]:
-    """Yield the worst number of each verdict, relative to its bar, for the worst verdicts."""
-    errors = [
-        (abs(error) / bar, row, name, pair, number)
+def _reason(row: Row, pair: Pair, number: str) -> str | None:
+    """Return why a number may be beyond its bar; empty if there is no reason, ``None`` if it is within its bar."""
+    bar, error = NUMBERS[number][1], pair.error(number)
+    if error is None or abs(error) <= bar:
+        return None
+    predicted, simulated = pair.values(number)
+    if number in VELOCITIES and abs(predicted - simulated) <= FELT * pair.speed:
+        return NEGLIGIBLE
+    return MOVES_LONG if row.long and abs(pair.error(number, still=True) or 0.0) <= bar else ""
+
+
+def _beyond(rows: Sequence[Row]) -> Iterator[str]:
+    """Yield all numbers beyond their bar with the reason, first those without a reason, then the worst."""
+    beyond = [
+        (bool(reason), -abs(pair.error(number) or 0.0) / bar, row, name, pair, number, reason)
         for row, name, pair in _pairs(rows)
         for number, (_, bar) in NUMBERS.items()
-        if (error := pair.error(number)) is not None
+        if (reason := _reason(row, pair, number)) is not None
     ]
-    worst = {id(error[1]): error for error in sorted(errors, key=lambda error: error[0])}
-    ordered = sorted(worst.values(), key=lambda error: -error[0])[:SHOWN]
-    yield f"The {len(ordered)} worst of {len(rows)} verdicts, each with its worst number:"
+    beyond.sort(key=lambda entry: (entry[0], entry[1]))
+    shown = f", the worst {SHOWN} of them" if len(beyond) > SHOWN else ""
+    yield f"Numbers beyond their bar in {len(rows)} verdicts{shown}: {len(beyond)}."
     yield ""
-    yield from table(_WORST, [_worst_row(*error[1:]) for error in ordered])
+    if beyond:
+        yield from table(_WORST, [_beyond_row(*entry[2:]) for entry in beyond[:SHOWN]])
 
 
-def _worst_row(row: Row, name: str, pair: Pair, number: str) -> list[str]:
+def _beyond_row(row: Row, name: str, pair: Pair, number: str, reason: str) -> list[str]:
     where = [row.case.name, f"{row.friction:g}", f"{row.stiffness:.0e}", row.feet]
-    values = [f"{getattr(side, number):.3g}" for side in (pair.predicted, pair.simulated)]
+    values = [f"{value:.3g}" for value in pair.values(number)]
     errors = [f"{100 * (pair.error(number, still=still) or 0.0):+.1f} %" for still in (False, True)]
-    return [*where, NUMBERS[number][0], name, *values, *errors, f"{1e3 * pair.time:.1f}"]
+    return [*where, NUMBERS[number][0], name, *values, *errors, f"{1e3 * pair.time:.1f}", reason or "**missed**"]
 
 
 def _counts(rows: Sequence[Row], request: Request) -> Iterator[str]:
@@ -111,36 +136,87 @@ def _counts(rows: Sequence[Row], request: Request) -> Iterator[str]:
     yield f"Stick or slip is as predicted in {same} of {len(sliding)} impacts with friction. The worst joint is the"
     yield f"predicted one in {sum(pair.named for pair in pairs)} of {len(pairs)} impacts."
     if rows[0].feet == "free":
-        stay = [pair for pair in pairs if not pair.predicted.moving]
-        move = [pair for pair in pairs if pair.predicted.moving]
-        surprising = sum(bool(pair.simulated.moving) for pair in stay)
-        same = sum(pair.simulated.moving == pair.predicted.moving for pair in move)
-        more = sum(bool(pair.simulated.moving - pair.predicted.moving) for pair in move)
-        yield f"A foot moves if its speed is above {100 * MOVES:g} % of the approach speed."
-        yield f"All feet should stay in {len(stay)} impacts; a foot moves in {surprising} of them."
-        yield f"Feet should move in {len(move)} impacts; the same feet move in {same}, and further feet in {more}."
+        yield from _feet(rows, request)
     unsolved = sum(pair.unsolved for pair in pairs)
     if unsolved:
         yield f"{unsolved} time steps of these simulations were not solved."
 
 
+def _feet(rows: Sequence[Row], request: Request) -> Iterator[str]:
+    pairs = _pairs(rows)
+    equal = sum(pair.predicted.moving == pair.simulated.moving for _, _, pair in pairs)
+    wrong = [entry for entry in pairs if entry[2].wrong_feet()]
+    share, near = f"{100 * MOVES:g} %", len(pairs) - equal - len(wrong)
+    yield f"A foot moves if its speed is above {share} of the approach speed. Feet move as predicted in {equal} of"
+    yield f"{len(pairs)} impacts. In {near} others, feet differ by less than {share} of the approach speed."
+    for row, name, pair in wrong:
+        predicted, simulated = (", ".join(sorted(side.moving)) or "none" for side in (pair.predicted, pair.simulated))
+        where = f"{row.case.name}, friction {row.friction:g}, {row.stiffness:.0e} N/m, {name}"
+        excused = row.long and pair.still.moving == pair.predicted.moving
+        yield f"- {where}: predicted {predicted}; simulated {simulated}{f' ({MOVES_LONG})' if excused else ''}"
+        if not excused:
+            request.missed.append(f"feet, {where}")
+
+
+def _holding(times: Sequence[HoldingTime], request: Request) -> Iterator[str]:
+    """Yield the contact times from which on the feet stay, the worst first."""
+    if not times:
+        return
+    ordered = sorted(times, key=lambda time: -abs(np.log(time.predicted / time.simulated)))
+    reasons = [_holding_reason(time) for time in ordered]
+    missed = reasons.count("")
+    yield from (
+        "",
+        f"Contact times from which on the feet stay, within {100 * HOLDING:g} %: {reasons.count(None)} of",
+    )
+    yield f"{len(times)}; robot moves: {reasons.count(MOVES_LONG)}; missed: {missed}. The worst first:"
+    yield ""
+    yield from table(_HOLDING, [_holding_row(*entry) for entry in zip(ordered, reasons, strict=True)])
+    if missed:
+        request.missed.append(f"contact time from which on the feet stay: {missed} of {len(times)}")
+
+
+def _holding_reason(time: HoldingTime) -> str | None:
+    """Return why a time may be beyond its bar, as :func:`_reason`."""
+    error, still = (abs(time.predicted / other - 1) for other in (time.simulated, time.still))
+    if error <= HOLDING:
+        return None
+    return MOVES_LONG if time.long and still <= HOLDING else ""
+
+
+def _holding_row(time: HoldingTime, reason: str | None) -> list[str]:
+    values = [f"{1e3 * value:.2g}" for value in (time.predicted, time.simulated)]
+    errors = [f"{100 * (time.predicted / other - 1):+.0f} %" for other in (time.simulated, time.still)]
+    word = "" if reason is None else reason or "**missed**"
+    return [time.case.name, f"{time.friction:g}", time.posture, *values, *errors, word]
+
+
 def _count(number: str, rows: Sequence[Row], request: Request) -> list[str]:
     words, bar = NUMBERS[number]
-    pairs = [pair for _, _, pair in _pairs(rows) if pair.error(number) is not None]
-    errors = [abs(pair.error(number) or 0.0) for pair in pairs]
-    still = [abs(pair.error(number, still=True) or 0.0) for pair in pairs]
-    changes = [change for row in rows if (change := row.changes(number)) and max(map(abs, change)) > NO_CHANGE]
+    errors = [error for _, _, pair in _pairs(rows) if (error := pair.error(number)) is not None]
+    reasons = [_reason(row, pair, number) for row, _, pair in _pairs(rows)]
+    missed = reasons.count("")
+    changes = [change for row in rows if (change := row.changes(number)) and _signed(row, number, change)]
     right = sum(first * second > 0 for first, second in changes)
-    inside = sum(error <= bar for error in errors)
     group = f"{rows[0].feet} feet" if rows[0].feet != "–" else "no feet"
-    if inside < len(errors):
-        request.missed.append(f"{words}, {group}: {len(errors) - inside} of {len(errors)} beyond {100 * bar:g} %")
+    if missed:
+        request.missed.append(f"{words}, {group}: {missed} of {len(errors)} beyond {100 * bar:g} %")
     if right < len(changes):
         request.missed.append(f"{words}, {group}: {len(changes) - right} of {len(changes)} signs wrong")
     return [
-        words, f"{100 * bar:g} %", f"{inside} of {len(errors)}", f"{100 * max(errors):.1f} %",
-        f"{sum(error <= bar for error in still)} of {len(still)}", f"{len(changes)}", f"{right}",
+        words, f"{100 * bar:g} %", f"{sum(abs(error) <= bar for error in errors)} of {len(errors)}",
+        f"{reasons.count(NEGLIGIBLE)}", f"{reasons.count(MOVES_LONG)}", f"{missed}",
+        f"{100 * max(map(abs, errors)):.1f} %", f"{len(changes)}", f"{right}",
     ]  # fmt: skip
+
+
+def _signed(row: Row, number: str, change: tuple[float, float]) -> bool:
+    """Return whether a number changes by more than 3 %, and a velocity by more than is negligible."""
+    if max(map(abs, change)) <= NO_CHANGE:
+        return False
+    first, last = row.before.values(number), row.after.values(number)
+    least = FELT * row.before.speed if number in VELOCITIES else 0.0
+    return max(abs(b - a) for a, b in zip(first, last, strict=True)) > least
 
 
 def _case(case: Case, rows: Sequence[Row]) -> list[str]:

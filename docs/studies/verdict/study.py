@@ -14,12 +14,12 @@ from impact_posture.config.problem_settings import ProblemSettings
 from impact_posture.config.table_validation import validate
 from impact_posture.impact.elasticity.contact_compression import ContactStiffness
 from impact_posture.impact.evaluation.evaluation import Evaluation
-from impact_posture.impact.evaluation.impact_effect import impact_effect
-from impact_posture.impact.friction.unilateral_impact import StandingFeet, UnilateralImpact, unilateral_impact
+from impact_posture.impact.friction.unilateral_impact import StandingFeet
 from impact_posture.impact.impact_contact import point_on
 from impact_posture.impact.resolved_impact import ResolvedImpact
 from impact_posture.posture.analysis.verdict import verdict
 from impact_posture.posture.analysis.verdict_changes import PredictedImpact
+from impact_posture.posture.analysis.verdict_conditions import LONG_TRAVEL
 from impact_posture.posture.formulation.problem_file import prepare
 from impact_posture.posture.search.multistart import solve
 from impact_posture.robot.robot import Robot
@@ -30,6 +30,8 @@ STIFFNESSES = (1e5, 1e6)
 MOVES = 0.01
 # The joint that the prediction names is right if no other joint has a share of its limit that is larger by 5 %.
 _SAME_JOINT = 0.05
+# Accuracy of the simulated contact time from which on the feet stay.
+_HOLDING = 0.05
 
 
 @dataclass(frozen=True)
@@ -88,6 +90,7 @@ class Numbers:
         impulse: Normal impulse, N·s.
         force: Largest normal force, N.
         slips: Whether the contact point slides.
+        feet: Frame of each foot → its speed, m/s; predicted at the end, simulated the largest during the contact.
         moving: Frames of the feet that lift or slide.
     """
 
@@ -98,6 +101,7 @@ class Numbers:
     impulse: float
     force: float
     slips: bool
+    feet: Mapping[str, float]
     moving: frozenset[str]
 
 
@@ -109,6 +113,7 @@ class Pair:
         still: The simulation with the mass matrix and the Jacobians of the first posture.
         named: Whether the joint that the prediction names has the largest share of its velocity limit in the
             simulation, up to 5 %.
+        speed: Approach speed, m/s.
         time: Simulated compression time, s.
         unsolved: Number of time steps whose conditions were not fulfilled.
     """
@@ -117,25 +122,40 @@ class Pair:
     simulated: Numbers
     still: Numbers
     named: bool
+    speed: float
     time: float
     unsolved: int
 
     def error(self, number: str, *, still: bool = False) -> float | None:
         """Return the relative error of a predicted number."""
-        predicted, measured = (
-            getattr(side, number) for side in (self.predicted, self.still if still else self.simulated)
-        )
+        predicted, measured = self.values(number, still=still)
         return None if predicted is None else predicted / measured - 1
+
+    def values(self, number: str, *, still: bool = False) -> tuple[float, float]:
+        """Return a predicted number and the simulated one; both are ``None`` without a floating base."""
+        return getattr(self.predicted, number), getattr(self.still if still else self.simulated, number)
+
+    def wrong_feet(self) -> list[str]:
+        """Return the feet that move in only one of both, and whose speeds differ by more than a moving foot has."""
+        different = self.predicted.moving ^ self.simulated.moving
+        least = MOVES * self.speed
+        return sorted(f for f in different if abs(self.predicted.feet[f] - self.simulated.feet[f]) > least)
 
 
 @dataclass(frozen=True)
 class Row:
-    """One verdict: case, friction, stiffness, whether the feet are held, and both postures."""
+    """One verdict: case, friction, stiffness, whether the feet are held, and both postures.
+
+    Attributes:
+        feet: ``held``, ``free``, or ``–`` for a robot without feet.
+        long: Whether the verdict says that the robot moves during the contact.
+    """
 
     case: Case
     friction: float
     stiffness: float
-    feet: str  # "–", "held" or "free"
+    feet: str
+    long: bool
     before: Pair
     after: Pair
 
@@ -149,10 +169,29 @@ class Row:
 
 
 @dataclass(frozen=True)
+class HoldingTime:
+    """The contact time, s, from which on the feet stay in one posture, predicted and simulated, up to 5 % each.
+
+    Attributes:
+        still: The simulated time with the mass matrix and the Jacobians of the first posture.
+        long: Whether the verdict would say that the robot moves during a contact of the predicted time.
+    """
+
+    case: Case
+    friction: float
+    posture: str
+    predicted: float
+    simulated: float
+    still: float
+    long: bool
+
+
+@dataclass(frozen=True)
 class Compared:
-    """Rows of one case at one friction, and why others are missing."""
+    """Rows of one case at one friction, contact times from which on its feet stay, and why rows are missing."""
 
     rows: tuple[Row, ...]
+    held: tuple[HoldingTime, ...]
     missing: tuple[str, ...]
 
 
@@ -161,44 +200,75 @@ def compare(case: Case, friction: float, starts: int) -> Compared:
     settings = {"robot": case.robot, "normal": case.normal, "friction": friction, "objective": "auto", **case.more}
     prepared = prepare(validate(ProblemSettings, settings, "options"))
     solution = solve(prepared.problem, starts=starts, jobs=1, compile="never")
+    postures, impact = (solution.initial, solution.q), prepared.impact
     rows, missing = list[Row](), list[str]()
     for stiffness in STIFFNESSES:
-        impact = replace(prepared.impact, contact_stiffness=ContactStiffness(linear=stiffness))
-        evaluations = [impact.evaluate(q) for q in (solution.initial, solution.q)]
-        said = verdict(impact, *evaluations)
-        sides = list(zip(evaluations, (said.before, said.after), strict=True))
+        stated = replace(impact, contact_stiffness=ContactStiffness(linear=stiffness))
+        evaluations = [stated.evaluate(q) for q in postures]
+        said = verdict(stated, *evaluations)
+        long = any(condition.key == "contact time" for condition in said.conditions)
         for feet in ("held", "free") if impact.supports else ("–",):
-            pairs = [_pair(impact, evaluation, predicted, feet) for evaluation, predicted in sides]
+            predicted = (said.unilateral if feet == "free" else None) or (said.before, said.after)
+            pairs = [_pair(stated, *side, feet) for side in zip(evaluations, predicted, strict=True)]
             reasons = [pair for pair in pairs if isinstance(pair, str)]
             if reasons:
                 missing.append(f"{case.name}, friction {friction:g}, {stiffness:g} N/m: {reasons[0]}")
             else:
-                rows.append(Row(case, friction, stiffness, feet, *pairs))
-    return Compared(tuple(rows), tuple(missing))
+                rows.append(Row(case, friction, stiffness, feet, long, *pairs))
+    held = []
+    for posture, q in zip(("before", "after"), postures, strict=True):
+        evaluation = impact.evaluate(q)
+        if evaluation.standing is not None and (time := evaluation.standing.holding_time) is not None:
+            simulated = [_holding_time(impact, evaluation, time, still=still) for still in (False, True)]
+            held.append(HoldingTime(case, friction, posture, time, *simulated, impact.speed * time > LONG_TRAVEL))
+    return Compared(tuple(rows), tuple(held), tuple(missing))
+
+
+def _holding_time(impact: ResolvedImpact, evaluation: Evaluation, predicted: float, *, still: bool) -> float:
+    """Return the contact time, s, from which on the simulated feet stay, between 2/3 and 3/2 of the prediction."""
+    robot, contact = impact.robot, impact.contact
+    hit = point_on(robot, contact.frame, contact.offset)
+    simulation = ImpactSimulation(
+        robot.model, evaluation.q, Point(hit.joint, hit.position), feet_of(robot)[0], still=still
+    )
+    low, high = np.log(predicted / 1.5), np.log(predicted * 1.5)
+    while high - low > _HOLDING:
+        middle = (low + high) / 2
+        stiffness = evaluation.contact_mass * (np.pi / 2 / np.exp(middle)) ** 2
+        result = simulation.run(Surface(np.array(contact.normal), impact.speed, stiffness, contact.friction))
+        low, high = (middle, high) if result.feet.max() > MOVES * impact.speed else (low, middle)
+    return float(np.exp((low + high) / 2))
 
 
 def _pair(impact: ResolvedImpact, evaluation: Evaluation, said: PredictedImpact, feet: str) -> Pair | str:
     """Simulate the impact in one posture; return a reason if there is nothing to compare."""
     robot, contact, q = impact.robot, impact.contact, evaluation.q
     surface = Surface(np.array(contact.normal), impact.speed, impact.contact_stiffness.linear, contact.friction)
-    moving = frozenset[str]()
+    oracle, n, model, standing = impact.objective.oracle.at(q), surface.normal, robot.model, evaluation.standing
+    slips, speeds, moving = not said.sticks, dict[str, float](), frozenset[str]()
     if feet == "free":
-        standing = StandingFeet(impact.objective.oracle, impact.supports, q, contact.friction)
-        unilateral = unilateral_impact(
-            standing, [impact.objective.oracle], surface.speed, evaluation.compression.time
-        )
-        if unilateral is None:
+        if standing is None:
             return "no prediction for feet that lift"
-        said, moving = _with(said, robot, unilateral, surface), frozenset((*unilateral.lifts, *unilateral.slides))
+        jump = standing.jump.velocity
+        under = StandingFeet(oracle, impact.supports, q, contact.friction)
+        speeds = _fastest(under.frames, np.linalg.norm((under.jacobian @ jump).reshape(-1, 3), axis=1))
+        moving = frozenset((*standing.lifts, *standing.slides))
+        if said.sticks is None:
+            contact_velocity = oracle.at(q).J @ jump
+            slips = np.linalg.norm(contact_velocity - (n @ contact_velocity) * n) > MOVES * surface.speed
+        if under.forces is None:
+            # The robot is beside its feet, so the prediction does not count the weight.
+            model = model.copy()
+            model.gravity.linear = np.zeros(3)
     predicted = Numbers(
         said.jump, said.base_linear, said.base_angular, said.joint.velocity, said.impulse, said.peak_force,
-        not said.sticks, moving,
+        bool(slips), speeds, moving,
     )  # fmt: skip
     points, frames = feet_of(robot)
     hit = point_on(robot, contact.frame, contact.offset)
     simulated = []
     for still in (False, True):
-        arguments = robot.model, q, Point(hit.joint, hit.position), points
+        arguments = model, q, Point(hit.joint, hit.position), points
         simulation = ImpactSimulation(*arguments, held=feet == "held", still=still)
         if not simulation.stands:
             return "the robot falls at rest"
@@ -207,19 +277,7 @@ def _pair(impact: ResolvedImpact, evaluation: Evaluation, said: PredictedImpact,
     (moved, result), (still_numbers, _) = simulated
     share = _worst_share(robot, result.jump)
     named = share[robot.tangent_names.index(said.joint.name)] >= (1 - _SAME_JOINT) * share.max()
-    return Pair(predicted, moved, still_numbers, bool(named), result.time, result.unsolved)
-
-
-def _with(said: PredictedImpact, robot: Robot, unilateral: UnilateralImpact, surface: Surface) -> PredictedImpact:
-    """Return the prediction with the jump and the impulse of feet that lift and slide."""
-    impulse = float(surface.normal @ unilateral.impulses[0])
-    return replace(
-        said,
-        **vars(impact_effect(robot, unilateral.jump)),
-        impulse=impulse,
-        peak_force=float(np.sqrt(surface.stiffness * surface.speed * impulse)),
-        jump=float(np.linalg.norm(unilateral.jump)),
-    )
+    return Pair(predicted, moved, still_numbers, bool(named), surface.speed, result.time, result.unsolved)
 
 
 def _numbers(robot: Robot, result: SimulatedImpact, joint: str, surface: Surface, frames: list[str]) -> Numbers:
@@ -233,8 +291,17 @@ def _numbers(robot: Robot, result: SimulatedImpact, joint: str, surface: Surface
         impulse=float(surface.normal @ result.impulse),
         force=result.force,
         slips=result.slip > least,
-        moving=frozenset(f for f, speed in zip(frames, result.feet, strict=False) if speed > least),
+        feet=(feet := _fastest(frames, result.feet)),
+        moving=frozenset(frame for frame, speed in feet.items() if speed > least),
     )
+
+
+def _fastest(frames: list[str], speeds: Vector) -> dict[str, float]:
+    """Return the speed of the fastest point of each foot, m/s; empty if the feet are held."""
+    return {
+        frame: max(float(v) for f, v in zip(frames, speeds, strict=False) if f == frame)
+        for frame in dict.fromkeys(frames[: len(speeds)])
+    }
 
 
 def _worst_share(robot: Robot, jump: Vector) -> Vector:

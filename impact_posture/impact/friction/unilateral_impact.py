@@ -11,8 +11,7 @@ surface:
 are computed for locked joints: they are the forces on a statue that stands on the same feet.
 
 The force of a linear contact is a quarter of a sine wave, and it is largest at T.  The impact is therefore solved in
-steps, in which the approach speed falls as ``v cos(πt/2T)``.  All feet stay if their loads exceed the largest pull,
-which is π/2 times its mean.
+steps, in which the approach speed falls as ``v cos(πt/2T)``.
 """
 
 from __future__ import annotations
@@ -29,10 +28,12 @@ from impact_posture.impact.quantities.impact_oracle import ImpactOracle
 from impact_posture.robot.robot_spec import Support
 from impact_posture.system.arrays import Array
 
-# A foot moves if its velocity is above this share of the approach speed.
+# A foot moves if its speed is above this share of the approach speed.
 _MOVES = 0.01
 # Number of steps of an impact in which the weight is counted.
 _STEPS = 8
+# The contact time from which on the feet stay is not resolved below this share of its largest value.
+_SHORTEST = 1e-4
 # A statue stands if its feet balance the weight up to this share.
 _STANDS = 1e-6
 # A singular value below this share of the largest one is a rounding error.
@@ -125,16 +126,21 @@ def unilateral_impact(
     contacts = _Contacts(feet, hit)
     # The approach speed that is left after each step.
     left = speed * np.cos(np.pi / 2 * np.linspace(0, 1, _STEPS + 1)[1:]) if time > 0 else np.zeros(1)
-    jump, impulses, moved = np.zeros(feet.M.shape[0]), np.zeros((len(hit), 3)), np.zeros((2, len(feet.frames)))
+    jump, impulses = np.zeros(feet.M.shape[0]), np.zeros((len(hit), 3))
+    fastest, up = np.zeros(len(feet.frames)), np.zeros(len(feet.frames))
     for speed_left in left:
         step = contacts.step(jump, speed, speed_left, time / len(left))
         if step is None:
             return None
         jump, impulses = jump + step[0], impulses + step[1]
         velocities = (feet.jacobian @ jump).reshape(-1, 3)
-        moved = np.maximum(moved, [velocities[:, 2], np.linalg.norm(velocities[:, :2], axis=1)])
-    lifts, slides = (list(dict.fromkeys(np.array(feet.frames)[row > _MOVES * speed].tolist())) for row in moved)
-    return UnilateralImpact(jump, impulses, tuple(lifts), tuple(frame for frame in slides if frame not in lifts))
+        fastest = np.maximum(fastest, np.linalg.norm(velocities, axis=1))
+        up = np.maximum(up, velocities[:, 2])
+    moves = fastest > _MOVES * speed
+    # A point that moves lifts, slides, or both; at least one of these velocities is above 1/√2 of the limit.
+    lifting = moves & (up > _MOVES * speed / np.sqrt(2))
+    lifts, moving = (dict.fromkeys(np.array(feet.frames)[points].tolist()) for points in (lifting, moves))
+    return UnilateralImpact(jump, impulses, tuple(lifts), tuple(frame for frame in moving if frame not in lifts))
 
 
 class _Contacts:
@@ -165,16 +171,14 @@ def longest_lifting_time(feet: StandingFeet, hit: Sequence[ImpactOracle], speed:
 
     The weight that a foot carries grows with the time, so bisection finds this time up to 5 %.
     """
-    contacts = _Contacts(feet, hit)
 
     def moves(time: float) -> bool:
-        # The largest pull is π/2 times its mean, so a single step with less weight tells whether a foot moves.
-        step = contacts.step(np.zeros(feet.M.shape[0]), speed, 0.0, 2 / np.pi * time)
-        return step is None or np.abs(feet.jacobian @ step[0]).max() > _MOVES * speed
+        impact = unilateral_impact(feet, hit, speed, time)
+        return impact is None or bool(impact.lifts or impact.slides)
 
     if moves(most):
         return np.inf
-    low, high = most * 1e-3, most
+    low, high = most * _SHORTEST, most
     if not moves(low):
         return 0.0 if not moves(0.0) else low
     while high > 1.05 * low:

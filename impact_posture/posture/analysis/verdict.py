@@ -10,6 +10,7 @@ from impact_posture.config.json_block import json_block
 from impact_posture.impact.elasticity.contact_compression import both_models
 from impact_posture.impact.evaluation.coulomb_jump import CoulombJump, coulomb_jump
 from impact_posture.impact.evaluation.evaluation import Evaluation
+from impact_posture.impact.evaluation.standing_impact import StandingImpact
 from impact_posture.impact.evaluation.velocity_jump import Jump, normal_jump
 from impact_posture.impact.resolved_impact import ResolvedImpact
 from impact_posture.posture.analysis.verdict_changes import (
@@ -38,6 +39,8 @@ class Verdict:
         advice: Advice, one line each: the jump without friction, a better objective, or a more accurate joint model.
         conditions: Conditions under which the numbers hold, the gravest first.
         before, after: The predicted impact in the initial and in the optimal posture; ``None`` if it is unknown.
+        unilateral: The same predictions if feet can lift and slide; ``None`` if base and joints feel what feet that
+            stay predict.
         assumptions: Assumptions behind the numbers, one line each.
     """
 
@@ -51,6 +54,7 @@ class Verdict:
     conditions: tuple[Condition, ...] = ()
     before: PredictedImpact | None = None
     after: PredictedImpact | None = None
+    unilateral: tuple[PredictedImpact, PredictedImpact] | None = None
     assumptions: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, object]:
@@ -77,6 +81,7 @@ def verdict(
         line = "; ".join(filter(None, [opening, f"no verdict, because {why}"]))
         return Verdict("unknown", f"verdict: {line}.", conditions=stated)
     sides, force = (_predicted(before, first), _predicted(after, last)), _force_change(before, after)
+    unilateral = _unilateral(impact, (before, after), sides)
     felt = changes(*sides, impact.speed, force, f" at {impact.contact.frame}" if together else "")
     outcome = outcome_of(felt)
     contact = f"with friction {impact.contact.friction:g}" if isinstance(last, CoulombJump) else "without friction"
@@ -87,7 +92,7 @@ def verdict(
     told = f"At {impact.speed:g} m/s {contact}: {', '.join(numbers)}."
     refuted = any(condition.refutes for condition in stated)
     opening += ". " if opening else ""
-    told = f"verdict: {opening}{_sentence(outcome, refuted, bool(opening))}. {told}{_lifted(impact, before, after)}"
+    told = f"verdict: {opening}{_sentence(outcome, refuted, bool(opening))}. {told}{_lifted(impact, unilateral)}"
     jump = relative_change(first.norm, last.norm)
     advice = (
         *(condition.hint for condition in stated if condition.hint),
@@ -107,6 +112,7 @@ def verdict(
         conditions=stated,
         before=sides[0],
         after=sides[1],
+        unilateral=unilateral,
         assumptions=_assumptions(impact, last, together, force),
     )
 
@@ -118,21 +124,38 @@ def _sentence(outcome: str, refuted: bool, later: bool) -> str:
     return outcome.capitalize() if later else outcome
 
 
-def _lifted(impact: ResolvedImpact, before: Evaluation, after: Evaluation) -> str:
-    """Return a sentence with the outcome and the numbers if the feet can lift and slide; empty if all feet stay."""
-    first, last = before.standing, after.standing
-    if first is None or last is None or not (first.moves or last.moves):
+def _unilateral(
+    impact: ResolvedImpact, evaluations: tuple[Evaluation, Evaluation], held: tuple[PredictedImpact, PredictedImpact]
+) -> tuple[PredictedImpact, PredictedImpact] | None:
+    """Return the predictions for feet that lift or slide; ``None`` if base and joints feel what held feet predict."""
+    first, last = (evaluation.standing for evaluation in evaluations)
+    if first is None or last is None:
+        return None
+    sides = _standing(impact, first), _standing(impact, last)
+    differ = [
+        change.grows or change.falls
+        for pair in zip(held, sides, strict=True)
+        for change in changes(*pair, impact.speed, None)
+    ]
+    return sides if first.moves or last.moves or any(differ) else None
+
+
+def _standing(impact: ResolvedImpact, standing: StandingImpact) -> PredictedImpact:
+    mass = standing.jump.normal_impulse / normal_jump(impact.speed, impact.restitution)
+    # If several contacts are struck at the same time, their forces are unknown.
+    contact = None if impact.objective.others else impact.contact_stiffness
+    return _felt(standing.jump, None if contact is None else contact.peak_force(mass, impact.speed))
+
+
+def _lifted(impact: ResolvedImpact, sides: tuple[PredictedImpact, PredictedImpact] | None) -> str:
+    """Return a sentence with the outcome and the numbers if the feet can lift and slide; empty without ``sides``."""
+    if sides is None:
         return ""
-    rebound = normal_jump(impact.speed, impact.restitution)
-    masses = [side.jump.normal_impulse / rebound for side in (first, last)]
-    forces: list[float | None] = [None, None]
-    if impact.contact_stiffness is not None and not before.contacts:
-        forces = [impact.contact_stiffness.peak_force(mass, impact.speed) for mass in masses]
-    sides = [_felt(side.jump, force) for side, force in zip((first, last), forces, strict=True)]
-    force = None if before.contacts else sqrt(masses[1] / masses[0]) - 1
-    if forces[0] is not None and forces[1] is not None:
-        force = relative_change(forces[0], forces[1])
-    felt = changes(sides[0], sides[1], impact.speed, force)
+    first, last = sides
+    force = None if impact.objective.others else sqrt(last.impulse / first.impulse) - 1
+    if first.peak_force is not None and last.peak_force is not None:
+        force = relative_change(first.peak_force, last.peak_force)
+    felt = changes(first, last, impact.speed, force)
     return f" With feet that lift or slide: {outcome_of(felt)}, {', '.join(change.line for change in felt)}."
 
 

@@ -13,7 +13,7 @@ Side = Literal["base", "joints", "impulse", "force"]
 # Relative changes below this value are about the same.
 SAME = 0.05
 # Changes of a velocity (m/s or rad/s) below this fraction of the approach speed (m/s) are negligible.
-_FELT = 0.01
+FELT = 0.01
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def changes(
 
     ``speed`` is the approach speed, m/s, and ``where`` names the contact of the impulse if there are several.
     """
-    return (*_velocities(before, after, _FELT * speed), *_contact(before, after, force, where))
+    return (*_velocities(before, after, FELT * speed), *_contact(before, after, force, where))
 
 
 def _velocities(before: ImpactLoad, after: ImpactLoad, least: float) -> Iterator[Change]:
