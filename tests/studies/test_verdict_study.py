@@ -12,7 +12,7 @@ from docs.studies.cases import BACK, DOWN
 from docs.studies.core import Request, Vector
 from docs.studies.verdict import impact_simulation, page
 from docs.studies.verdict.impact_simulation import ImpactSimulation, Point, SimulatedImpact, Surface
-from docs.studies.verdict.study import Case, Compared, Pair, compare, feet_of
+from docs.studies.verdict.study import Case, Compared, Numbers, Pair, Row, compare, feet_of
 from impact_posture.impact.impact_contact import point_on
 from impact_posture.robot.posture_files import read_posture
 from tests.support.helpers import robot
@@ -175,7 +175,7 @@ def test_wrong_predictions_are_worst_and_missed(monkeypatch: pytest.MonkeyPatch)
     def wrong(case: Case, friction: float, starts: int) -> Compared:
         compared = compare(case, friction, starts)
         rows = [replace(row, before=_larger(row.before)) for row in compared.rows]
-        return Compared(tuple(rows), compared.missing)
+        return replace(compared, rows=tuple(rows))
 
     monkeypatch.setattr(page, "compare", wrong)
     text = "\n".join(page.lines(request))
@@ -186,3 +186,22 @@ def test_wrong_predictions_are_worst_and_missed(monkeypatch: pytest.MonkeyPatch)
 
 def _larger(pair: Pair) -> Pair:
     return replace(pair, predicted=replace(pair.predicted, impulse=1.08 * pair.predicted.impulse))
+
+
+@pytest.mark.parametrize(
+    ("angular", "still", "long", "reason"),
+    [
+        (1.04, 1.00, False, None),
+        (1.06, 1.00, False, ""),
+        (1.06, 1.00, True, "robot moves"),
+        (1.06, 1.06, True, ""),
+        (0.06, 0.06, False, "negligible"),
+    ],
+)
+def test_a_number_beyond_its_bar_needs_a_reason(angular: float, still: float, long: bool, reason: str | None) -> None:
+    """The predicted angular velocity is 1 or 0.05 rad/s, at 1 m/s."""
+    predicted = Numbers(1.0, 1.0, 1.0 if angular > 1 else 0.05, 1.0, 1.0, 1.0, False, {}, frozenset())
+    sides = (replace(predicted, angular=value) for value in (angular, still))
+    pair = Pair(predicted, *sides, named=True, speed=1.0, time=0.02, unsolved=0)
+    row = Row(Case("solo8", BACK), 0.3, 1e5, "free", long, pair, pair)
+    assert page._reason(row, pair, "angular") == reason

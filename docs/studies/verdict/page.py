@@ -38,7 +38,6 @@ VELOCITIES = ("linear", "angular", "joint")
 NO_CHANGE = 0.03
 # Largest relative error of the contact time from which on the feet stay, predicted and simulated up to 5 % each.
 HOLDING = 0.20
-SHOWN = 25
 # Reasons why a number may be beyond its bar.
 NEGLIGIBLE, MOVES_LONG = "negligible", "robot moves"
 _WORST = "case|friction|k, N/m|feet|number|posture|predicted|simulated|error|error, posture still|T, ms|reason".split(
@@ -111,11 +110,10 @@ def _beyond(rows: Sequence[Row]) -> Iterator[str]:
         if (reason := _reason(row, pair, number)) is not None
     ]
     beyond.sort(key=lambda entry: (entry[0], entry[1]))
-    shown = f", the worst {SHOWN} of them" if len(beyond) > SHOWN else ""
-    yield f"Numbers beyond their bar in {len(rows)} verdicts{shown}: {len(beyond)}."
+    yield f"Numbers beyond their bar in {len(rows)} verdicts: {len(beyond)}."
     yield ""
     if beyond:
-        yield from table(_WORST, [_beyond_row(*entry[2:]) for entry in beyond[:SHOWN]])
+        yield from table(_WORST, [_beyond_row(*entry[2:]) for entry in beyond])
 
 
 def _beyond_row(row: Row, name: str, pair: Pair, number: str, reason: str) -> list[str]:
