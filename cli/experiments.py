@@ -71,6 +71,7 @@ def rows_table(page: Page, rows: tuple[ControllerRow, ...] | list[ControllerRow]
 def _loads_table(page: Page, rows: tuple[ControllerRow, ...] | list[ControllerRow]) -> None:
     """Write a table of the effects on base, joints and contact, with one row per controller."""
     from impact_posture.experiment.reproduction_summary import joint_text
+    from impact_posture.simulation.metrics import AFTER_TOUCH
 
     lines = []
     for row in rows:
@@ -83,5 +84,5 @@ def _loads_table(page: Page, rows: tuple[ControllerRow, ...] | list[ControllerRo
         page.gap()
         head = ("  controller", "base m/s", "rad/s", "force N", "N·s", "worst joint, % of its limit")
         page.table(head, lines, right=(1, 2, 3, 4))
-        when = "in the pushes" if rows[0].approach is None else "within 15 ms of the touch"
+        when = "in the pushes" if rows[0].approach is None else f"within {AFTER_TOUCH}"
         page.line(f"  largest changes of velocity, and normal impulse, {when}", style="dim")

@@ -12,19 +12,20 @@ from impact_posture.experiment.seed_statistics import FEWEST, Interval, headline
 from impact_posture.output.plot.result_view import number
 from impact_posture.output.plot.run_view import RunView, run_header
 from impact_posture.output.report.report_page import Content, Table
+from impact_posture.simulation.metrics import AFTER_TOUCH
 from impact_posture.system.output_folder import typed_command
 
 # Metrics in the table of a report: key, unit and meaning.
 _METRICS = (
     ("q_total_impact", "m, rad", "way of the robot in the impact windows, ∫‖ν‖dt"),
     ("q_total_recovery", "m, rad", "the same until 1 s after each impact began"),
-    ("peak_jump", "m/s, rad/s", "largest ‖ν − ν⁻‖ within 15 ms of the touch, mean of the contacts"),
+    ("peak_jump", "m/s, rad/s", f"largest ‖ν − ν⁻‖ within {AFTER_TOUCH}, mean of the contacts"),
     ("peak_jump_max", "m/s, rad/s", "the largest of the contacts"),
     ("peak_recovery", "m/s, rad/s", "as peak_jump, until 1 s after each impact began"),
     ("peak_force", "N", "largest normal force in the impact windows"),
     ("slip", "m", "way that the contact slid in the impact windows"),
 )
-# Effects on base, joints and contact within 15 ms of the touch: key, unit and meaning.
+# Effects on base, joints and contact just after the touch: key, unit and meaning.
 _LOADS = (
     ("base_linear", "m/s", "largest change of the base's linear velocity, mean of the contacts"),
     ("base_angular", "rad/s", "the same of its angular velocity"),
@@ -87,7 +88,7 @@ def table_metrics(view: RunView) -> list[tuple[str, str, str]]:
 def _load_table(prediction: Mapping[str, Any], view: RunView) -> Table:
     """Return the table of the effects on base, joints and contact, as measured and as predicted."""
     measured, predicted = (_load_cells(prediction[f"{key}_impact"]) for key in ("measured", "predicted"))
-    title = "In the pushes" if view.pushed else "Within 15 ms of the touch"
+    title = "In the pushes" if view.pushed else f"Within {AFTER_TOUCH}"
     rows = [(key, measured[key], predicted[key], unit, meaning) for key, unit, meaning in _LOADS]
     return Table(title, ("", "measured", "rigid prediction", "unit", "meaning"), tuple(rows))
 

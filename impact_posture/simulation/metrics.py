@@ -13,6 +13,8 @@ from impact_posture.simulation.setup import Setup
 
 # The velocity jump is measured within this time after the first touch, s.
 JUMP = 0.015
+# The same time in words.
+AFTER_TOUCH = f"{1e3 * JUMP:g} ms of the touch"
 # A command is saturated if its distance from a limit is below this share of the range.
 _NEAR = 1e-3
 
