@@ -46,7 +46,7 @@ def announce(page: Page, prepared: Prepared) -> None:
 
 
 def summarize(page: Page, prepared: Prepared, solution: PostureSolution, document: dict[str, Any]) -> None:
-    """Print the result: verdict, table of values before and after, certificate, trade-off and path."""
+    """Print the result: verdict, table of values at the start and at the optimum, certificate, trade-off and path."""
     from impact_posture.output.quantity_table import answer_key, quantity_rows
     from impact_posture.posture.search.impact_notes import percent
 
@@ -90,7 +90,7 @@ def summarize(page: Page, prepared: Prepared, solution: PostureSolution, documen
         bare = len(document["collision"]["links_without_shapes"])
         among = f" among the links that have shapes ({bare} ha{'ve' if bare > 1 else 's'} none)" if bare else ""
         page.line(f"no collision{among}; closest: {at['closest']}, {1e3 * at['distance']:.3g} mm")
-    # Count optima by their printed value, because mirrored postures have equal values.
+    # Count optima by their printed value.  The values of mirrored postures differ only by rounding errors.
     hits = Counter[str]()
     for optimum in solution.optima:
         hits[number(optimum.objective)] += optimum.hits

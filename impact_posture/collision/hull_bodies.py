@@ -73,6 +73,9 @@ def _fill(a: Body, b: Body) -> bool:
 
 
 def _thinned(corners: Array) -> Array:
-    """Return the farthest corners along 200 directions, because coal allows at most 255 edges at a corner."""
+    """Keep only the corners that are farthest along one of 200 directions.
+
+    At most 200 corners remain, so no corner has more than 199 edges.  Coal allows at most 255.
+    """
     directions = shape_points(coal.Sphere(1.0))
     return corners[np.unique((corners @ directions.T).argmax(axis=0))] if len(corners) > len(directions) else corners

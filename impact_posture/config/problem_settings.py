@@ -109,7 +109,7 @@ class LoadOptions(StrictTable):
 
 @dataclass(frozen=True, kw_only=True)
 class RobotSettings(LoadOptions):
-    """Name of a robot, and options of loading it.
+    """Name of a robot, and options for loading it.
 
     Attributes:
         robot: Known name, path to a ``.urdf``, or ``example-robot-data:<path>``.

@@ -36,9 +36,10 @@ from impact_posture.system.arrays import Array
 class WorstCaseObjective:
     """Worst case of ``λ̄²H`` (impulse), ``V`` (speed), ``S`` (sticking), ``C`` (coulomb) or ``E`` (energy).
 
-    The class implements the :class:`~impact_posture.impact.objective.Objective` protocol for every combination of an
-    objective type (:mod:`impact_posture.impact.kinds.kinds_by_name`), a metric, supports, contacts, a cone of normals
-    and model variants.  :mod:`impact_posture.impact.worst_case` has a class for each type of maximum.
+    ``λ̄`` is the largest impulse of the contact along the normal.  The class implements the
+    :class:`~impact_posture.impact.objective.Objective` protocol for every combination of an objective type
+    (:mod:`impact_posture.impact.kinds.kinds_by_name`), a metric, supports, contacts, a cone of normals and model
+    variants.  :mod:`impact_posture.impact.worst_case` has a class for each type of maximum.
 
     Attributes:
         robot: The robot.
@@ -89,7 +90,7 @@ class WorstCaseObjective:
 
     @property
     def scale(self) -> float:
-        """Ratio of the value to H, V, S or E: λ̄² for ``impulse``, else 1."""
+        """Factor between the value and H, V, S, C or E: λ̄² for ``impulse``, else 1."""
         return self.impact_kind.factor
 
     @property

@@ -1,4 +1,4 @@
-"""Rows of the table of an impact before and after: keys, units and meanings for terminal and report."""
+"""Rows of the table of an impact at start and optimum: keys, units and meanings for terminal and report."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def answer_key(document: dict[str, Any]) -> str:
 
 
 def quantity_rows(impact: ResolvedImpact, initial: dict[str, Any], optimal: dict[str, Any]) -> list[QuantityRow]:
-    """Return the rows of the table before and after.
+    """Return the rows of the table with the values at the start and at the optimum.
 
     The first rows state the effects on base, joints and contact at the given speed and friction.  The fastest
     approach, the norm of the jump, the objective, and H to E follow.  Unknown quantities have no row.  ``initial``

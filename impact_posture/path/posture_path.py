@@ -41,8 +41,8 @@ class PosturePath:
         t: Times, s, shape (n,); a single zero without a motion.  Between two times, the motion is a
             :class:`~impact_posture.path.row_interpolation.RowInterpolation`.
         q: Postures, shape (n, nq).
-        v: Velocities ``ν``, shape (n, nv).
-        a: Accelerations ``ν̇``, shape (n, nv).
+        v: Generalized velocities ``ν``, shape (n, nv).
+        a: Generalized accelerations ``ν̇``, shape (n, nv).
         length: Tangent length of the path, rad mixed with m.
         max_violation: Largest violation of a constraint or joint limit at the postures.
         use: Shares of the limits over time; ``None`` without a motion.

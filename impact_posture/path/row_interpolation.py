@@ -1,4 +1,4 @@
-"""The motion between the rows of a path: quintic polynomials, as ROS interpolates a ``JointTrajectory``."""
+"""The motion between the rows of a path: quintic polynomials, as in ``joint_trajectory_controller`` of ROS."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class RowInterpolation:
     Attributes:
         t: Times of the rows, s, shape (n,).
         q: Postures, shape (n, nq).
-        v: Velocities ``ν``, shape (n, nv).
-        a: Accelerations ``ν̇``, shape (n, nv).
+        v: Generalized velocities ``ν``, shape (n, nv).
+        a: Generalized accelerations ``ν̇``, shape (n, nv).
     """
 
     model: pin.Model

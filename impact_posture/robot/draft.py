@@ -238,7 +238,7 @@ def _armature(draft: Draft, robot: Robot, options: LoadOptions) -> None:
     if options.armature is not None:
         draft.lines += ["", "[armature]"]
         draft.key("source", robot.armature_source, "name the data sheet here")
-        draft.key("joints", values, "kg m^2 (kg for a prismatic joint), as --armature says")
+        draft.key("joints", values, "kg m^2 (kg for a prismatic joint); values given with --armature")
     elif any(values.values()):
         low, high = min(v for v in values.values() if v), max(values.values())
         draft.note(f"Armature: read from the SRDF's rotor_params, {low:.3g} to {high:.3g} kg m^2 a joint.")

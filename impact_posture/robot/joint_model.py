@@ -66,7 +66,8 @@ def with_joint_model(robot: Robot, joint_model: JointModel) -> Robot:
 
     - ``reflected`` keeps the armature at all joints.
     - ``link`` removes the armature, except at joints with a ``rigid`` transmission.
-    - ``locked`` locks all joints, as position control with stiff gears does, so that only a floating base moves.
+    - ``locked`` locks all joints, so that only a floating base moves.  Position control with stiff gears has the same
+      effect.
     - ``elastic`` removes the armature at joints with springs of known stiffness.  H, G, V, S and E then describe the
       first instant of the impact.  The rotors follow later
       (:mod:`impact_posture.impact.elasticity.elastic_impact`).

@@ -52,7 +52,7 @@ class Series:
     Attributes:
         t: Time, s, shape (n,).
         q: True configuration, shape (n, nq).
-        v: True velocity ν, shape (n, nv).
+        v: True generalized velocity ν, shape (n, nv).
         torque: Commanded joint torques after clipping to the limits, shape (n, joints).
         rotor_command: Commanded rotor speeds after clipping to the limits, shape (n, rotors).
         rotor_speed: True rotor speeds, shape (n, rotors).

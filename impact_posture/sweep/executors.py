@@ -86,7 +86,8 @@ class SlurmJobs(Executor):
     def __init__(self, folder: Path, options: dict[str, Any], cluster: str | None = None) -> None:
         check_package("submitit", "slurm")
         self._folder, self._options, self._cluster = folder, options, cluster
-        # submitit creates its folder at once.  The check uses a temporary folder, so invalid options leave no folder.
+        # submitit creates the folder together with the executor.  Check the options in a temporary folder, so that
+        # invalid options leave no folder.
         with TemporaryDirectory() as trial:
             try:
                 self._executor(Path(trial))

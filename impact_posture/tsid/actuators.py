@@ -20,8 +20,8 @@ class Actuators:
     Attributes:
         rotors: Number of rotors.
         base: 6 for a floating base, else 0.
-        G: Shape (nv, controls).
-        inverse: ``G_b⁺``, shape (rotors, base).
+        G: Actuation matrix, shape (nv, controls).
+        inverse: Pseudo-inverse ``G_b⁺``, shape (rotors, base).
         blind: Orthonormal basis of the base wrenches that rotors cannot produce, shape (base, base − rank).
         spare: Orthonormal basis of the null space of ``G_b``, shape (rotors, rotors − rank).
         rank: Rank of ``G_b``.

@@ -183,7 +183,7 @@ class Controller:
         Args:
             t: Time, s.
             q: Configuration, shape (nq,).
-            v: ν, shape (nv,).
+            v: Generalized velocity ν, shape (nv,).
             force: Measured contact force (3) or wrench (6) on the robot at ``force_point``, world axes.
 
         Raises:

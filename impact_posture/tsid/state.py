@@ -16,12 +16,12 @@ from impact_posture.tsid.point_kinematics import Point, PointKinematics, PointSt
 
 
 class State:
-    """``M``, ``h``, point Jacobians, drifts and center of mass at ``(q, ν)``.
+    """``M``, ``h``, point Jacobians, drifts and center of mass at the configuration ``q`` and the velocity ``ν``.
 
     Attributes:
         points: Points whose kinematics the state computes.
         q: Copy of the configuration, shape (nq,), with quaternions and cosine-sine pairs of unit length.
-        v: Copy of ν, shape (nv,).
+        v: Copy of the generalized velocity ν, shape (nv,).
         M: Mass matrix with armature, shape (nv, nv); a view on the data of Pinocchio.
         h: Coriolis, centrifugal and gravity terms, shape (nv,); a view on the data of Pinocchio.
         room: Distances of the joints from their upper limits (first row) and lower limits (second row), rad (m),

@@ -54,7 +54,7 @@ class ElasticResponse:
     """Response of links, rotors and springs to a contact, from touch to the greatest compression at the time ``T``.
 
     All quantities are proportional to ``speed``, except ``stiffness``, ``duration``, ``compliance_ratio`` and
-    ``value``.
+    ``value``.  ``W`` is the weight matrix of the metric.
 
     Attributes:
         stiffness: Stiffness ``k`` of the contact, N/m.
@@ -67,7 +67,8 @@ class ElasticResponse:
         impulse: Impulse ``∫f dt`` from touch to ``T``, N·s.
         jump: Velocity jump ``ẋ(T)`` of base and links, shape (nv,).
         jump_norm: Norm ``‖ẋ(T)‖_W`` of the jump.
-        value: ``‖ẋ(T)‖²_W/v²``; equal to V for rigid joints.
+        value: Squared jump per squared approach speed, ``‖ẋ(T)‖²_W/v²``.  For rigid joints, this is V, the objective
+            ``speed``.
         peak_jump_norm: Largest ``‖ẋ(t)‖_W`` from touch to ``T``.
         rotor_jump: Velocity jump ``ẏ(T)`` of the rotors, shape (nv,); equal to ``jump`` for joints without a spring.
         torque: Torque ``τ(T)`` of springs and dampers, shape (nv,), N·m (N for prismatic joints).  Zero for joints

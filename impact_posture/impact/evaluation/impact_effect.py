@@ -64,7 +64,7 @@ class ImpactLoad(ImpactEffect):
         joint: Joint with the largest ratio of velocity jump to velocity limit; ``None`` if there are no joints.
         impulse: Normal impulse at the first contact, N·s.
         peak_force: Largest normal force, N; ``None`` if it is unknown, or for several contacts.
-        jump: Norm ``‖Δν‖_W`` of the jump of base and joints.
+        jump: Norm ``‖Δν‖_W`` of the jump of base and joints, with the weight matrix ``W`` of the metric.
     """
 
     impulse: float

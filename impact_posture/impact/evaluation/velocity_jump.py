@@ -20,7 +20,7 @@ class Jump:
 
     Attributes:
         velocity: Velocity jump ``Δν``, shape (nv,), m/s and rad/s.
-        norm: Norm ``‖Δν‖_W``.
+        norm: Norm ``‖Δν‖_W`` of the jump, with the weight matrix ``W`` of the metric.
         impulse: Impulse of the surface on the robot, world axes, shape (3,), N·s.
         normal_impulse: Part of the impulse along the normal, N·s.
         effect: Jump of the base and of the worst joint.

@@ -19,7 +19,8 @@ from impact_posture.impact.quantities.impact_quantities import ImpactQuantities
 from impact_posture.impact.quantities.sticking_point import ImpulseResponse, StickingPoint, no_sticking
 from impact_posture.system.arrays import Array
 
-# Number of postures whose matrices are stored, because a search evaluates its initial postures repeatedly.
+# Number of postures whose matrices are stored.  A search evaluates its initial postures repeatedly, and then reuses
+# these matrices.
 _KEPT = 32
 
 
@@ -234,8 +235,8 @@ class ImpactOracle:
     def inertial(self, left: ImpulseResponse, right: ImpulseResponse) -> Array:
         """Return ``∂_q lᵀ(M + J_sᵀJ_s/ε)r = ∂_q [lᵀMr − f_lᵀJ_s r − f_rᵀJ_s l]``, shape (nv,).
 
-        ``l``, ``f_l`` and ``r``, ``f_r`` are the constant velocity jumps and support impulses of ``left`` and
-        ``right``.
+        ``l`` and ``r`` are the velocity jumps of ``left`` and ``right``, and ``f_l`` and ``f_r`` are their support
+        impulses.  The derivative treats all four as constant.
         """
         gradient = self.numeric.inertial_gradient(left.a, right.a)
         start = 0

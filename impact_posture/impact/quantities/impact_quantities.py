@@ -17,17 +17,17 @@ class ImpactQuantities:
     """The impact quantities of one contact at one posture.
 
     Attributes:
-        H: ``nᵀΛ_c n``, squared jump per squared impulse.
+        H: Squared jump per squared impulse, ``nᵀΛ_c n``.
         G: Inverse effective mass along the normal, ``nᵀJM⁻¹Jᵀn = 1/m_eff``, 1/kg.
-        V: ``H/G²``, squared jump per squared approach speed (frictionless, e = 0).
+        V: Squared jump per squared approach speed, ``H/G²`` (frictionless, e = 0).
         S: Squared jump per squared approach speed if the contact sticks; ``None`` if it cannot stick at this posture.
-        E: ``1/(2G)``, energy dissipated per squared approach speed (e = 0), which is half the effective mass, kg.
+        E: Energy dissipated per squared approach speed, ``1/(2G)`` (e = 0), which is half the effective mass, kg.
         jump: Velocity jump per unit impulse, ``a = M⁻¹Jᵀn``, shape (nv,).
         sticking_jump: Jump per unit approach speed if the contact sticks, shape (nv,); ``None`` if S is ``None``.
         sticking_impulse: Impulse per unit approach speed if the contact sticks, world axes, shape (3,); ``None`` if S
             is ``None``.
         ellipsoid: Dynamic impact ellipsoid ``Λ_c``, world axes, shape (3, 3).
-        mobility: ``JM⁻¹Jᵀ``, world axes, shape (3, 3), 1/kg.
+        mobility: Velocity change of the contact point per impulse, ``JM⁻¹Jᵀ``, world axes, shape (3, 3), 1/kg.
         normal: World unit normal, shape (3,).
         support_impulse: Impulses ``f`` of all supports per unit impulse on the contact, shape (rows,).
     """

@@ -41,9 +41,10 @@ class Kind:
         formula: Formula of the matrix, for the legend.
         unit: Unit of the semi-axes.
         scale: Longest finite semi-axis in the initial posture.
-        matrices: Matrices before and after, divided by ``scale²``.  Unbounded directions end far outside the panel.
+        matrices: Matrices at the start and at the optimum, divided by ``scale²``.  Unbounded directions end far
+            outside the panel.
         finite: Like ``matrices``, but with zero in the unbounded directions.
-        endless: Unbounded directions before and after, as columns of shape (3, k).
+        endless: Unbounded directions at the start and at the optimum, as columns of shape (3, k).
     """
 
     name: str
@@ -81,10 +82,10 @@ def kinds_of(view: ResultView) -> list[Kind]:
 
 
 def classical_figure(view: ResultView) -> Figure:
-    """Draw the shadows of ``JJᵀ``, ``(JJᵀ)⁻¹`` and ``Λ_c`` on the coordinate planes, before and after.
+    """Draw the ellipsoids of ``JJᵀ``, ``(JJᵀ)⁻¹`` and ``Λ_c`` at the start and at the optimum.
 
-    All panels share a scale, but the three ellipsoids have different units.  If ``JJᵀ`` is singular, the force
-    ellipsoid is unbounded, and the label of its panel states this.
+    The panels show projections onto the coordinate planes.  All panels share a scale, but the three ellipsoids have
+    different units.  If ``JJᵀ`` is singular, the force ellipsoid is unbounded, and its panel states this.
     """
     kinds = kinds_of(view)
     limit = 1.18 * max(1.0, *(_longest(matrix) for kind in kinds for matrix in kind.finite))
@@ -112,7 +113,7 @@ def _longest(matrix: Array) -> float:
 
 
 def _unbounded(plane: Plane, kind: Kind, which: int) -> str:
-    """Return a note for the panel if the shadow of an ellipsoid on the plane is unbounded, else an empty text."""
+    """Return a note for the panel if the projection of an ellipsoid onto the plane is unbounded, else ``""``."""
     directions = kind.endless[which]
     seen = np.linalg.svd(plane.axes @ directions, compute_uv=False) if directions.shape[1] else np.zeros(0)
     rank = int((seen > 1e-6).sum())

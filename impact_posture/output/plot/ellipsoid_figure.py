@@ -1,4 +1,4 @@
-"""Figure ``ellipsoid``: the dynamic impact ellipsoid Λ_c before and after, as shadows and in space."""
+"""Figure ``ellipsoid``: the impact ellipsoid Λ_c at the start and the optimum, projected onto planes and in 3-D."""
 
 from __future__ import annotations
 
@@ -65,11 +65,12 @@ class _State:
 
 
 def ellipsoid_figure(view: ResultView) -> Figure:
-    """Draw Λ_c before (dashed) and after (solid): shadows on the coordinate planes, and in 3-D with √H along n.
+    """Draw Λ_c at the start (dashed) and at the optimum (solid), projected onto planes and in 3-D, with √H along n.
 
-    Shadows on planes that contain n have tangent lines at ±√H.  If no coordinate plane contains n, the upright plane
-    through n is added.  All axes are equal and share one scale.  Thin lines show the ellipsoids without support feet.
-    For an uncertain normal, the figure shows the cone of normals and the worst normals.
+    The planes are the coordinate planes.  If none of them contains n, the upright plane through n is added.
+    Projections onto planes that contain n have tangent lines at ±√H.  All axes are equal and share one scale.  Thin
+    lines show the ellipsoids without support feet.  For an uncertain normal, the figure shows the cone of normals
+    and the worst normals.
     """
     states = [_State("before", view.before, BEFORE), _State("after", view.after, AFTER)]
     for word, free, line in zip(("before", "after"), view.free, (FREE_BEFORE, FREE_AFTER), strict=False):
@@ -135,7 +136,7 @@ def _panel(axes: Any, plane: Plane, states: list[_State], limit: float, unit: st
 
 
 def _tangents(axes: Any, plane: Plane, state: _State, limit: float) -> None:
-    """Draw the two tangent lines of the shadow that are perpendicular to n."""
+    """Draw the two tangent lines of the projection that are perpendicular to n."""
     flat = plane.axes @ state.at.normal
     flat = flat / np.linalg.norm(flat)
     along = np.array([-flat[1], flat[0]]) * 3 * limit
@@ -199,7 +200,7 @@ def _legend(axes: Any, states: list[_State], unit: str, view: ResultView) -> Non
 
 
 def draw_uncertainty(axes: Any, plane: Plane, view: ResultView, limit: float) -> None:
-    """Draw the shadow of the cone of normals and the worst normals.  If n turns, draw a cone for each posture."""
+    """Draw the projected cone of normals and the worst normals.  If n turns, draw a cone for each posture."""
     for n in _cones(view):
         outline = cone_shadow(n, view.objective.normal_cone_deg, REACH * limit, plane.axes)
         axes.fill(*outline, facecolor=PALE, edgecolor="none", alpha=0.55, zorder=0.5)

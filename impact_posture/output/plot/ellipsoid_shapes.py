@@ -1,4 +1,4 @@
-"""Ellipsoids as points and lines: shadows on planes, half-widths and surfaces."""
+"""Ellipsoids as points and lines: projections onto planes, half-widths and surfaces."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def half_width(matrix: Array, direction: Array) -> float:
 
 
 def shadow(matrix: Array, axes: Array, points: int = 181) -> Array:
-    """Return the edge of the projection of ``{x: xᵀΛ⁻¹x ≤ 1}`` on the plane of ``axes``, shape (2, points).
+    """Return the edge of the projection of ``{x: xᵀΛ⁻¹x ≤ 1}`` onto the plane of ``axes``, shape (2, points).
 
     The projection is the ellipse of ``P Λ Pᵀ``, where the rows of ``P = axes`` are orthonormal.  A degenerate ellipse
     is a segment or a point.

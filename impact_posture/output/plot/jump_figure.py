@@ -1,4 +1,7 @@
-"""Figure ``jump``: the velocity jump Δν of each joint before and after, per impulse and at the approach speed."""
+"""Figure ``jump``: the velocity jump Δν of each joint at the start and at the optimum.
+
+The jumps are per impulse and at the approach speed.
+"""
 
 from __future__ import annotations
 

@@ -77,7 +77,7 @@ class ResultView:
         tradeoff: Trade-off of objective against distance or force; ``None`` if it was not computed.
         motion: Path to the optimum over time; ``None`` if it was not searched.
         self_motion: Map of the self-motion manifold; ``None`` if it was not computed.
-        collisions: Pairs of names of colliding shapes, before and after.
+        collisions: Pairs of names of colliding shapes, at the start and at the optimum.
         depths: Distance from each contact point to the surface behind it, m; empty without surroundings.
         pushed: Whether the robot is pushed (free contact pose) instead of striking a surface.
     """
@@ -112,7 +112,7 @@ class ResultView:
 
     @cached_property
     def free(self) -> tuple[ImpactQuantities, ...]:
-        """Quantities before and after, computed without the supports; empty if there are no supports."""
+        """Quantities at the start and at the optimum, without the supports; empty if there are no supports."""
         if not self.objective.supports:
             return ()
         oracle = ImpactOracle(replace(self.objective.case, supports=()))
@@ -120,7 +120,7 @@ class ResultView:
 
     @cached_property
     def worst(self) -> tuple[WorstNormal | None, WorstNormal | None]:
-        """Worst normals of the cone before and after, world; ``None`` without a cone or if they are undefined."""
+        """Worst normals at the start and at the optimum, world; ``None`` without a cone or if they are undefined."""
 
         def worst(q: Array) -> WorstNormal | None:
             try:
@@ -168,7 +168,7 @@ def contact_letters(view: ResultView) -> list[str]:
 
 
 def header_lines(view: ResultView) -> tuple[str, list[str]]:
-    """Return the title of a figure and two lines below it: the settings, and H, G, V, S and E before and after."""
+    """Return the title of a figure and two lines below it: settings, and H, G, V, S and E at start and optimum."""
     contact, metric, robot = view.objective.contact, view.objective.metric, view.robot
     named = zip(view.objective.contacts, contact_letters(view), strict=True)
     frames = ", ".join(f"{each.frame}{letter and f' ({letter.strip()})'}" for each, letter in named)
@@ -198,7 +198,7 @@ def header_lines(view: ResultView) -> tuple[str, list[str]]:
 
 
 def _worst_values(view: ResultView) -> str:
-    """Return the objective before and after as text if it is a worst case over several impacts, else ``""``."""
+    """Return a worst-case objective at the start and at the optimum as text; ``""`` for a single impact."""
     if isinstance(view.objective.worst_case, ImpactKind):
         return ""
     return " " + " → ".join(number(objective_value(view.objective, q)) for q in (view.q_initial, view.q_optimal))

@@ -32,7 +32,7 @@ class RunView:
         contact: Impact contact with its frame, its offset, and the world normal out of the surface (or along a push).
         t: Time, s, increasing, shape (n,).
         q: Configuration, shape (n, nq).
-        v: Velocity ν, shape (n, nv).
+        v: Generalized velocity ν, shape (n, nv).
         torque: Commanded joint torques, N·m (N for sliding joints), shape (n, joints).
         rotor_command: Commanded rotor speeds, shape (n, rotors).
         rotor_speed: Measured rotor speeds, shape (n, rotors).

@@ -33,7 +33,7 @@ class Verdict:
             ``better for … at the price of …``, ``no better``, ``worse``, ``cannot arrive`` or ``unknown``.
         line: The conditions, the outcome and the numbers in words.
         minimized: Name of the minimized objective, and change of the norm of the jump, in words.
-        jump: Relative change of ``‖Δν‖_W``; ``None`` if it is unknown.
+        jump: Relative change of the norm ``‖Δν‖_W`` of the jump; ``None`` if it is unknown.
         impulse: Relative change of the normal impulse.
         peak_force: Relative change of the peak force with friction; ``None`` if it is unknown.
         advice: Advice, one line each: the jump without friction, a better objective, or a more accurate joint model.

@@ -27,7 +27,8 @@ _EDGES = 4
 # Upper limit of the friction coefficient.  With a larger coefficient, the edges of the friction pyramid would be
 # nearly horizontal and could hardly support weight.
 _MOST_FRICTION = 10.0
-# Singular values of the map from forces to the base wrench are zero below this fraction of the largest one.
+# Singular values of the map from rotor thrusts and foot forces to the base wrench are zero below this fraction of
+# the largest one.
 _RANK = 1e-9
 
 
@@ -35,8 +36,9 @@ _RANK = 1e-9
 class LoadCase:
     """One load that the robot has to hold; ``name`` is for example ``at rest``.
 
-    The rows of ``unreachable``, shape (6 − r, 6), are combinations of the base wrench that the rotors cannot produce.
-    Here r is the rank of the map from forces to the base wrench.
+    The rows of ``unreachable``, shape (6 − r, 6), are combinations of the base wrench that rotors and feet cannot
+    produce.  Here r is the rank of the map from rotor thrusts and foot forces to the base wrench.  For a fixed base,
+    there are no such rows.
     """
 
     name: str

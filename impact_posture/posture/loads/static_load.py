@@ -26,7 +26,7 @@ class ForceSource:
 
     Attributes:
         point: Point on the link where the wrench acts, with the axes of the frame.
-        columns: ``W``, force (N) above moment (N·m) about the point per unit z, shape (6, k).
+        columns: Matrix ``W``: force (N) above moment (N·m) about the point per unit z, shape (6, k).
         lower, upper: Bounds of z, shape (k,).
         in_frame: Whether the wrench is given in the axes of the frame, so that it turns with the link; otherwise in
             world axes.

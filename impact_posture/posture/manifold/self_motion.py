@@ -27,17 +27,18 @@ _TURN, _STRAIGHT = 0.98, 0.995
 # A posture belongs to a node only if its distance from the tangent space of the node is at most this share of its
 # distance from the node.
 _FLAT = 0.2
-# Each point of a curve is closer to a node than this share of a step.  This share of a step is slightly more than
-# half, because the curve bends.
+# Each point of a curve is closer to a node than this share of a step.  On a straight line, half a step would suffice.
+# Where the curve bends, points between two nodes are slightly farther away.
 _HALF = 0.52
 # Maximum number of nodes of a curve or surface.
 _NODES = 20_000
 # For surfaces: length of a step, least distance between nodes as a share of the step, and number of directions of
 # steps.
 _STEP, _APART, _DIRECTIONS = 0.16, 0.7, 8
-# Radius that a node of a surface covers, as a share of the step.  Consider a point one step away from a node.  A
-# tried point lies within half the angle between directions, and a node lies within the least distance between nodes
-# from the tried point.
+# Radius that a node of a surface covers, as a share of the step.  Consider a point one step away from a node.
+# Seen from the node, the nearest tried point is at most half the angle between directions away, and this angle
+# determines its distance from the point.  Some node is closer to the tried point than the least distance between
+# nodes.  The radius is the sum of both distances.
 COVERED = _APART + 2 * np.sin(np.pi / _DIRECTIONS / 2)
 _BATCH = 100
 

@@ -68,7 +68,7 @@ class FlowPosture(ImpactRobustPosture):
     the flow as fast as the impact-robust term.  Bound and fade near joint limits are the same as for this term.
 
     Attributes:
-        basis: ``Z``, shape (nv, r); ``None`` to stop the flow.
+        basis: Basis ``Z`` of the motions that the other tasks leave free, shape (nv, r); ``None`` to stop the flow.
     """
 
     def reset(self, state: State) -> None:

@@ -143,7 +143,7 @@ class Truth(NamedTuple):
     Attributes:
         t: Time since the reset, s.
         q: Configuration, shape (nq,).
-        v: ν, shape (nv,).
+        v: Generalized velocity ν, shape (nv,).
         rotor_speeds: Rotor speeds in the unit of ``speed_max``, shape (rotors,).
         thrusts: Thrusts, N, shape (rotors,).
         torques: Joint torques of the last step, after clipping to the limits, shape (joints,).

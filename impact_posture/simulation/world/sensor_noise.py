@@ -25,7 +25,7 @@ class Reading(NamedTuple):
     Attributes:
         t: Time of the reading, s.  The measured state may be older (``Sensors.delay``).
         q: Configuration, shape (nq,).
-        v: ν, shape (nv,).
+        v: Generalized velocity ν, shape (nv,).
         force: Filtered force of the surfaces on the shape with the force sensor, world, N, shape (3,); ``None`` if
             there is no force sensor.
     """

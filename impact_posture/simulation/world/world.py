@@ -82,7 +82,7 @@ class World:
 
         Args:
             q: Configuration, shape (nq,).
-            v: ν, shape (nv,).  Zero by default.
+            v: Generalized velocity ν, shape (nv,).  Zero by default.
             seed: Seed of all noise.
             rotor_speed: Speeds of the propellers, shape (rotors,).  By default, the speeds that make the robot hover
                 at ``q``.

@@ -47,10 +47,10 @@ class FlowOptions:
         speed: Largest speed ``v`` of an entry of ``q_r``, rad/s (m/s).
         acceleration: Largest acceleration ``a``, rad/s² (m/s²).  The speed is limited so that ``2a/5`` suffices to
             stop the flow at the end of its step.
-        rho: ρ in ``Φ`` (:class:`FlowDirection`), the weight of the squared distance from the start, 1/rad².
-        mu: μ, per rad², relative to ``H₀``.  Absolute curvatures below μ are raised to μ.
-        epsilon: ε, relative to ``H₀``.  The flow rests if the predicted decrease of ``H`` is below ε, and resumes if
-            it is above 4 ε.
+        rho: Weight ρ in ``Φ`` (:class:`FlowDirection`) of the squared distance from the start, 1/rad².
+        mu: Smallest absolute curvature μ, per rad², relative to ``H₀``.  Smaller absolute curvatures are raised to μ.
+        epsilon: Threshold ε, relative to ``H₀``.  The flow rests if the predicted decrease of ``H`` is below ε, and
+            resumes if it is above 4 ε.
         duration: Longest time that the flow moves after each start, s.  Time on a path or at rest is not included.
         joint_margin: Distance from the joint limits, rad (m); at most an eighth of the range of a joint.
         com_margin: Distance of the center of mass from the edges of the support polygon, m.

@@ -60,7 +60,7 @@ class ReferenceFlow:
     Attributes:
         q: Reference posture ``q_r``, shape (nq,).
         velocity: Velocity ``u`` of ``q_r`` (``q̇_r = u``), rad/s (m/s), shape (nv,).
-        acceleration: ``u̇``, rad/s² (m/s²), shape (nv,).
+        acceleration: Acceleration ``u̇`` of ``q_r``, rad/s² (m/s²), shape (nv,).
         value: ``H(q_r)`` at the last update.
         start: ``H₀``, the absolute value of ``H`` at the reset.
         on: Whether the flow may move.

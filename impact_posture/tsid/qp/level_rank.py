@@ -33,10 +33,11 @@ class LevelRank:
     - ``x = 0``: the levels above determine the row, or the row contradicts other rows of its level.  The row is
       removed from the QP.  The other rows give the least-squares answer of the level.
     - Otherwise, the row is damped: it becomes a term ``α/(1 − α) (q·ν̇ − c/s)² + x (q·ν̇)²`` of the cost, with
-      ``α = x²(3 − 2x)``.  ``q`` is the row's direction of motion, and ``c`` is its right-hand side.  The term is
-      multiplied by the mean weight of the accelerations in the cost.  With decreasing ``x``, the row changes smoothly
-      from an equation to nothing, so accelerations are continuous through a singular posture.  The accelerations are
-      at most ``3/s₀`` times ``c``.  The levels below can use the direction with the factor ``√(1 − α)``.
+      ``α = x²(3 − 2x)``.  ``q = Zv`` is the row's direction of motion (not the configuration), where ``v`` is
+      the column of ``V`` that belongs to ``s``.  ``c`` is the row's right-hand side.  The term is multiplied by the
+      mean weight of the accelerations in the cost.  With decreasing ``x``, the row changes smoothly from an equation
+      to nothing, so accelerations are continuous through a singular posture.  The accelerations are at most ``3/s₀``
+      times ``c``.  The levels below can use the direction with the factor ``√(1 − α)``.
 
     The result depends only on the present rows and on their lengths at reset.  While all rows are independent, all of
     them remain equations.  A singular value changes at most by the norm of the change of the matrix (Weyl 1912), so

@@ -94,7 +94,7 @@ class ImpactRobustPosture(JointPosture):
 
     Attributes:
         K: Gain, 1/s².
-        scale: ``λ``, in the objective's unit per rad².
+        scale: Curvature scale ``λ``, in the objective's unit per rad².
         activation: Phase and level ``α`` of the term.
         value: ``H`` (or the objective) at the last evaluation.
         term: Bounded term ``−K s(q) ∇H/λ`` at the last evaluation, for ``α = 1``, shape (nv,).
