@@ -53,9 +53,10 @@ class ImpactObjective(WorstCaseObjective):
         metric: Norm of the velocity jump: ``euclidean``, ``kinetic`` or ``weighted``, or a
             :class:`~impact_posture.impact.metric.Metric`.
         kind: Minimized quantity: ``impulse`` (λ̄²H), ``speed`` (V), ``sticking`` (S), ``coulomb`` (C) or ``energy``
-            (E), as in ``docs/notation.md``.  ``None`` selects ``impulse``.  But if the contact states its friction,
-            ``None`` selects the same quantity as ``--objective auto`` on the command line.  A
-            :class:`PostureProblem` that states the speed or the elasticity of the contact also does this.
+            (E).  λ̄ is the largest impulse of the contact, and ``docs/notation.md`` defines the other symbols.
+            ``None`` selects ``impulse``.  But if the contact states its friction, ``None`` selects the same quantity
+            as ``--objective auto`` on the command line.  A :class:`PostureProblem` that states the speed or the
+            elasticity of the contact also does this.
         supports: Feet that stay in place during the impact, as ``FRAME[:point|surface]``; ``None`` selects the feet
             of robot.toml, ``()`` selects no feet.
         compliance: Compliance ε of the supports, 1/kg; 0 selects 1e-4 divided by the mass of the robot.

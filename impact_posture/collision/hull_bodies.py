@@ -73,7 +73,7 @@ def _fill(a: Body, b: Body) -> bool:
 
 
 def _thinned(corners: Array) -> Array:
-    """Keep only the corners that are farthest along one of 200 directions.
+    """Keep only the corners that are farthest along one of 200 directions, if there are more than 200 corners.
 
     At most 200 corners remain, so no corner has more than 199 edges.  Coal allows at most 255.
     """

@@ -23,9 +23,10 @@ class Prediction:
 
     Attributes:
         contact: Number of the contact, starting at 0.
-        H: ``nᵀΛ_c n`` just before the impact: squared jump per squared impulse.
-        G: ``nᵀBn`` just before the impact, with the mobility ``B = J M⁻¹Jᵀ``, 1/kg.
-        V: ``H/G²``: squared jump per squared approach speed without friction.
+        H: Squared jump per squared impulse just before the impact, ``nᵀΛ_c n``.
+        G: Inverse effective mass along the normal just before the impact, ``nᵀBn`` with the mobility ``B = J M⁻¹Jᵀ``,
+            1/kg.
+        V: Squared jump per squared approach speed without friction, ``H/G²``.
         S: Squared jump per squared approach speed if the contact sticks; ``None`` if S is undefined.
         approach: Approach speed ``v`` of robot and surface (or ball) just before the impact, m/s.  For pushes, the
             impulse of the push, N·s.

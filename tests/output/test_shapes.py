@@ -1,4 +1,4 @@
-"""Shadows, half widths, sections, polars and cones, compared with sampled points."""
+"""Projections, half widths, sections, polars and cones, compared with sampled points."""
 
 from __future__ import annotations
 

@@ -55,7 +55,8 @@ class Evaluation:
     Attributes:
         q: Configuration, shape (nq,).
         scalars: H, G, V, S and E, computed with the supports; also attributes of the evaluation.
-        objective: Value of the objective, with the factor λ̄²; ``None`` if it does not exist at ``q``.
+        objective: Value of the objective; for ``impulse`` with the factor λ̄², where λ̄ is the largest impulse of the
+            contact.  ``None`` if it does not exist at ``q``.
         gradient: Tangent gradient of H, shape (nv,).
         objective_gradient: Tangent gradient of the objective, shape (nv,); ``None`` if it does not exist at ``q``.
         normal: Unit normal for which H, G, V, S, E and the jumps are computed, world axes, shape (3,).

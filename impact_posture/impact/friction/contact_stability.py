@@ -2,8 +2,8 @@
 
 The metric assumes that the feet stay in place, even if the ground would have to pull.  If ``J_s`` does not have full
 row rank, the support impulses are not unique.  All solutions are ``f + N z``, where ``N`` is a basis of ``{f: J_sᵀ f
-= 0}``, the impulses with which feet press against each other.  The weight is a finite
-force, and an impact takes no time.  The weight therefore has no impulse, and no effect.
+= 0}``, the impulses with which feet press against each other.  The weight is a finite force,
+and an impact takes no time.  The weight therefore has no impulse, and no effect.
 """
 
 from __future__ import annotations

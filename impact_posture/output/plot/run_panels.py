@@ -90,7 +90,7 @@ class Panel:
         ranges: For each run, lower and upper bound of a shaded band, shape (n, 2).
         stopped: For each run, whether the joint of a curve was at its stop, shape (n, curves).
         note: Sentence below the figure.
-        noisy: Whether the curves contain noise, as the commands of flying robots.
+        noisy: Whether the curves contain noise, like the commands of flying robots.
         scale: Scale of the vertical axis: ``auto``, ``from zero``, or ``metric`` (logarithmic if H varies strongly).
         overlay: Whether all runs are drawn in the same panel, with different line styles.
     """

@@ -127,7 +127,7 @@ def support_edges(state: State, contacts: Sequence[SupportContact]) -> tuple[Arr
     if edges is None:
         return np.vstack([np.eye(2), -np.eye(2)]), np.full(4, np.inf)
     normals, offsets = edges
-    # Sort the edges from the leftmost corner, as the C code does, because the motion depends on their order.
+    # Sort the edges from the leftmost corner.  The C code has the same order, and the motion depends on it.
     turn = np.arctan2(normals[:, 1], normals[:, 0])
     order = np.argsort(np.where(turn < _START - np.pi, np.pi, turn))
     return normals[order], -offsets[order]
