@@ -163,7 +163,7 @@ def test_a_result_saves_what_the_command_line_writes(
     assert python == cli
     toml = [(folder / "problem.toml").read_text().splitlines() for folder in (written.out, theirs)]
     # The settings in Python do not include the number of starts, unlike the command line.
-    assert [a for a, b in zip(*toml, strict=True) if a != b] == ["starts = 16"]
+    assert toml[0] == [line for line in toml[1] if line != "starts = 2"] != toml[1]
     assert run("optimize", written.out / "problem.toml", "--out", "again", "--starts", 2, "--no-codegen",
                cwd=tmp_path).returncode == 0  # fmt: skip
 

@@ -14,6 +14,7 @@ from impact_posture.errors import ContactError, FrameNotFound, InputError
 from impact_posture.impact.evaluation.ellipsoids import classical_ellipsoids, ellipsoid_of, force_ellipsoid
 from impact_posture.impact.evaluation.evaluation import Evaluation, evaluate
 from impact_posture.impact.evaluation.impact_effect import tangent_units
+from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.impact.resolved_impact import resolve
 from impact_posture.impact.support_compliance import default_compliance
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
@@ -56,10 +57,13 @@ def planar(tmp_path: Path) -> str:
     return str(path)
 
 
-def dense(loaded: Robot, frame: str, q: np.ndarray, n: np.ndarray, W: np.ndarray | None, feet: tuple[Support, ...]):
+def dense(
+    loaded: Robot, contact: ImpactContact, q: np.ndarray, n: np.ndarray, W: np.ndarray | None,
+    feet: tuple[Support, ...],
+):  # fmt: skip
     """Return H, G, V, S, Λ_c, a and the sticking jump, computed by inverting ``M + J_sᵀJ_s/ε``."""
     M = mass_matrix(loaded.model, q)
-    J = frame_jacobian(loaded.model, q, loaded.frame_id(frame))[:3]
+    J = frame_jacobian(loaded.model, q, loaded.frame_id(contact.frame), contact.offset)[:3]
     inertia = M.copy()
     for foot in feet:
         Js = frame_jacobian(loaded.model, q, loaded.frame_id(foot.frame), foot.offset)[: foot.rows]
@@ -92,7 +96,7 @@ def test_numbers_against_dense_algebra(name: str, frame: str, metric: str) -> No
     impact = resolve(ImpactSettings(robot=name, frame=frame, normal=tuple(n), metric=metric, impulse=3.0))  # type: ignore[arg-type]
     evaluation = evaluate(impact.objective, impact.q, 0.7, 0.3)
     W = mass_matrix(loaded.model, impact.q) if metric == "kinetic" else None
-    expected = dense(loaded, frame, impact.q, n, W, impact.supports)
+    expected = dense(loaded, impact.contact, impact.q, n, W, impact.supports)
     # Adding 1/ε to the link masses before inversion reduces the accuracy.
     tolerance = 1e-6 if impact.supports else 1e-10
     for key in ("H", "G", "V", "S", "E"):
@@ -119,7 +123,7 @@ def test_free_values_stand_beside_the_supported_ones() -> None:
     impact = resolve(ImpactSettings(robot="talos", frame="torso_2_link", normal=(-2.0, 0.0, 0.0)))
     evaluation = evaluate(impact.objective, impact.q)
     assert [s.frame for s in impact.supports] == ["left_sole_link", "right_sole_link"]
-    expected = dense(loaded, "torso_2_link", impact.q, n, None, ())
+    expected = dense(loaded, impact.contact, impact.q, n, None, ())
     assert evaluation.without_supports is not None
     for key in ("H", "G", "V", "S", "E"):
         assert_close(evaluation.without_supports.to_dict()[key], expected[key], 1e-10, key)  # type: ignore[arg-type]
@@ -143,7 +147,7 @@ def test_the_predicted_jumps_obey_the_impact() -> None:
         evaluation.frictionless is not None and evaluation.sticking is not None and evaluation.energy_loss is not None
     )
     n = evaluation.worst_normal
-    parts = dense(robot("tilthex_arm"), "ee", impact.q, n, None, ())
+    parts = dense(robot("tilthex_arm"), impact.contact, impact.q, n, None, ())
     J, M = parts["J"], parts["M"]
     before = rng("approach").normal(size=9)
     along = n @ J
@@ -233,7 +237,9 @@ def test_an_impossible_approach_is_refused(speed: float, restitution: float) -> 
 
 def test_classical_ellipsoids() -> None:
     impact = resolve(ImpactSettings(robot="panda", normal=(0.0, 0.0, 1.0)))
-    J = frame_jacobian(impact.robot.model, impact.q, impact.robot.frame_id("panda_hand_tcp"))[:3]
+    J = frame_jacobian(impact.robot.model, impact.q, impact.robot.frame_id("panda_hand_tcp"), impact.contact.offset)[
+        :3
+    ]
     ellipsoids = classical_ellipsoids(impact.objective, impact.q)
     for name, matrix in (("velocity", J @ J.T), ("force", np.linalg.inv(J @ J.T))):
         axes, radii = ellipsoids[name].axes, ellipsoids[name].radii

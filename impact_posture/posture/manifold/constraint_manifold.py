@@ -88,7 +88,7 @@ class ConstraintManifold:
     def merit(self, x: Array) -> tuple[Array, Array]:
         """Return ``ln f + μ Σ e²``, shape (N,), and its tangent gradient, shape (N, nv).
 
-        ``f`` is the objective, and ``e`` are the violations of the inequalities that are expressions of the posture.
+        ``f`` is the objective, and ``e`` are the violations of the inequalities onto which postures are projected.
         The value is not finite where the objective is not defined.
         """
         value, gradient = self.objective(x)
@@ -102,10 +102,12 @@ class ConstraintManifold:
     def _penalty_function(self, tree: Tree, motion: ca.SX, x: ca.SX) -> BatchFunction | None:
         terms = ca.SX(0)
         for constraint in self._inequalities:
-            if isinstance(constraint, ExpressionConstraint):
+            if isinstance(constraint, ExpressionConstraint) and constraint.projected:
                 value = constraint.symbolic(tree, ca.SX(ca.DM(constraint.parameters)))
                 for bounds, sign in ((constraint.lower, -1.0), (constraint.upper, 1.0)):
                     rows = np.flatnonzero(np.isfinite(bounds)).tolist()
+                    if not rows:
+                        continue
                     excess = ca.fmax(sign * (value[rows] - ca.DM(bounds[rows])), 0)
                     terms += _PENALTY * ca.dot(excess, excess)
         if terms.is_zero():
