@@ -54,8 +54,8 @@ FITTED = {"aerial-vertical": _AERIAL, "aerial-lateral": _AERIAL, "solo8-push": _
 # Scenario → controller that meets its targets in most variations of the scenario (docs/reproduction.md).  If no
 # controller meets the targets, the entry is the controller that misses them least.
 RECOMMENDED: dict[str, str] = {
-    "aerial-vertical": "posture",
-    "aerial-lateral": "robust-flow",
+    "aerial-vertical": "robust-flow",
+    "aerial-lateral": "posture",
     "solo8-push": "stiff",
     "talos-push": "robust-flow",
 }
