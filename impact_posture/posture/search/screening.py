@@ -22,9 +22,9 @@ from impact_posture.system.arrays import Array
 
 # Number of descents under way.  New descents begin when a quarter of them has ended.
 _WIDTH = 256
-# The number of descents, times the square of the degrees of freedom, is limited by the first number, because
+# The number of descents, times the third power of the degrees of freedom, is limited by the first number, because
 # descents of large robots take longer.  At least the second number is allowed.
-_WORK, _LEAST = 100_000, 48
+_WORK, _LEAST = 1_300_000, 16
 # Share of the random postures near the initial posture, and of the new descents that are hops.
 _NEAR, _HOPPING = 0.25, 0.5
 # Number of best ends from which hops start, and shares of the joints to which a hop gives random values.
@@ -34,8 +34,9 @@ _SAME, _EQUAL = 0.05, 5e-3
 # The search stops when the best end was hit this often, and no better end was reached in the last share of all
 # descents.
 _HITS, _IDLE = 3, 0.5
-# Number of starts of IPOPT, half of them at the best ends and half at the most different good ends.
-_GUESSES = 12
+# Number of starts of IPOPT, half of them at the best ends and half at the most different good ends.  The number,
+# times the degrees of freedom, is limited by the second number, because a solution takes longer for large robots.
+_GUESSES, _SOLVED = 12, 200
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ def screenable(problem: ConstrainedProblem) -> bool:
 def screen(problem: ConstrainedProblem, initial: Array, most: int, seed: int) -> Screening:
     """Screen at most ``most`` random postures and hops, some of them near the posture ``initial``, shape (nq,)."""
     search = _Search(problem, initial, seed)
-    most = min(most, max(_LEAST, _WORK // problem.robot.nv**2))
+    most = min(most, max(_LEAST, _WORK // problem.robot.nv**3))
     width, drawn = min(_WIDTH, most), 0
     while True:
         room = width - search.descent.active
@@ -111,7 +112,8 @@ class _Search:
         leaders, label = self._optima()
         hits = np.bincount(label[self.ends.tag == 0], minlength=len(leaders))
         projector, guesses = Projector(self._problem), dict[int, Array]()
-        for k in _best_and_different(manifold.embed(self.ends.x[leaders]), _GUESSES):
+        count = min(_GUESSES, _SOLVED // self._problem.robot.nv)
+        for k in _best_and_different(manifold.embed(self.ends.x[leaders]), max(count, 2)):
             projection = projector.project(manifold.to_q(self.ends.x[leaders[k]]))
             if projection.violation <= FEASIBLE:
                 guesses[k] = projection.q
