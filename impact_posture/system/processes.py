@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager, suppress
@@ -29,6 +30,8 @@ _UNFINISHED: list[tuple[int, Callable[[], None]]] = []
 # Number of active :func:`signals_held` blocks, and the ``leave`` functions of signals that arrived in these blocks.
 _HELD = [0]
 _LATER: list[Callable[[], None]] = []
+# Number of hundredths of a second for which a copy may remove its temporary folders before it is killed.
+_PATIENCE = 100
 
 _PR_SET_PDEATHSIG = 1
 
@@ -145,15 +148,23 @@ def fork_call(function: Callable[[], _Result]) -> Iterator[Callable[[], _Result]
         if child == 0:
             receiver.close()
             depend(parent)
+            # With SIGTERM, the copy removes its temporary folders before it ends.
+            _HELD[0] = 0
+            multiprocessing.process._children.clear()  # type: ignore[attr-defined]
+            signal.signal(signal.SIGTERM, lambda *_: end_early(lambda: os._exit(1)))
             _send_result(function, sender)
     sender.close()
 
     def kill() -> None:
         # Kill only a child that still runs, because the system may give the id of an ended child to another process.
         with suppress(ChildProcessError):
-            if os.waitpid(child, os.WNOHANG) == (0, 0):
-                os.kill(child, signal.SIGKILL)
-                os.waitpid(child, 0)
+            for _ in range(_PATIENCE):
+                if os.waitpid(child, os.WNOHANG) != (0, 0):
+                    return
+                os.kill(child, signal.SIGTERM)
+                time.sleep(0.01)
+            os.kill(child, signal.SIGKILL)
+            os.waitpid(child, 0)
 
     def collect() -> _Result:
         try:
