@@ -23,7 +23,7 @@ from impact_posture.posture.search.impact_notes import notes_on_impacts
 from impact_posture.posture.search.initial_posture import initial_objective, initial_posture
 from impact_posture.posture.search.screening import screen, screenable
 from impact_posture.posture.search.start_draws import StartDraws
-from impact_posture.posture.search.unseen_optima import SearchEstimate
+from impact_posture.posture.search.unseen_optima import SearchEstimate, hits_by_value
 from impact_posture.system.arrays import Array
 
 # Two final postures are the same optimum if their tangent distance and the relative difference of their objectives
@@ -166,14 +166,16 @@ def solve(
         count = len(certified) - len(good)
         notes.append(f"{count} certified postures left out, because original shapes touch there: {touching}")
     dominated = sum(r.dominated for r in runs)
-    # Starts that did not end at a certified posture would lead elsewhere.
-    others = [1] * dominated if screening is None else [count for count in screening.others if count]
-    estimate = SearchEstimate.of(
-        "multistart" if screening is None else "adaptive",
-        [*(o.hits for o in optima), *others],
-        hits_of_best(optima),
-        0 if screening is None else screening.hops,
-    )
+    if screening is None:
+        relative = np.array([o.objective for o in optima]) / max(abs(optima[0].objective), 1e-300)
+        values = hits_by_value(relative, [o.hits for o in optima])
+        # Where starts would have led that could not become the best is unknown.
+        values += (1,) * dominated
+        estimate = SearchEstimate.of("multistart", values, hits_of_best(optima), bound=dominated > 0)
+    else:
+        # Descents stop early in flat valleys.
+        more = screening.hops, True, screening.partial
+        estimate = SearchEstimate.of("adaptive", screening.values, hits_of_best(optima), *more)
     if estimate.hits_of_best <= 1 and estimate.starts >= _MANY:
         notes.append("at most one start ended at the best optimum: more `starts` may find a better one")
     return PostureSolution(

@@ -14,10 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.posture.constraints.constraint import ExpressionConstraint
 from impact_posture.posture.manifold.batch_descent import BatchDescent, Ends
 from impact_posture.posture.manifold.constraint_manifold import ConstraintManifold
 from impact_posture.posture.manifold.feasible_start import FEASIBLE, Projector, random_posture
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem
+from impact_posture.posture.search.unseen_optima import SAME_VALUE, hits_by_value
 from impact_posture.system.arrays import Array
 
 # Number of descents under way.  New descents begin when a quarter of them has ended.
@@ -29,8 +31,8 @@ _WORK, _LEAST = 1_300_000, 16
 _NEAR, _HOPPING = 0.25, 0.5
 # Number of best ends from which hops start, and shares of the joints to which a hop gives random values.
 _ELITE, _REDRAWN = 4, (0.1, 0.25, 0.5)
-# Distance (rad, m) and difference of the merit below which two ends are the same optimum.
-_SAME, _EQUAL = 0.05, 5e-3
+# Distance (rad, m) below which two ends are the same optimum if their merits differ by less than SAME_VALUE.
+_SAME = 0.05
 # The search stops when the best end was hit this often, and no better end was reached in the last share of all
 # descents.
 _HITS, _IDLE = 3, 0.5
@@ -46,13 +48,16 @@ class Screening:
     Attributes:
         guesses: Postures from which IPOPT starts, shape (nq,) each.
         hits: Number of random postures that descended to each guess.
-        others: Number of random postures that descended to each of the other ends.
+        values: For each distinct objective where descents ended, best first: the number of random postures that
+            descended to it.
+        partial: Whether the problem has constraints that descents ignore, such as clearances.
         hops: Number of hops.
     """
 
     guesses: tuple[Array, ...]
     hits: tuple[int, ...]
-    others: tuple[int, ...]
+    values: tuple[int, ...]
+    partial: bool
     hops: int
 
 
@@ -102,7 +107,7 @@ class _Search:
         """Return whether the best end was hit often enough, and reached early enough."""
         if len(self.ends.x) < least:
             return False
-        best = np.flatnonzero(self.ends.merit <= self.ends.merit.min() + _EQUAL)
+        best = np.flatnonzero(self.ends.merit <= self.ends.merit.min() + SAME_VALUE)
         hits = int((self.ends.tag[best] == 0).sum())
         return hits >= _HITS and bool(best[0] < (1 - _IDLE) * len(self.ends.x))
 
@@ -117,8 +122,9 @@ class _Search:
             projection = projector.project(manifold.to_q(self.ends.x[leaders[k]]))
             if projection.violation <= FEASIBLE:
                 guesses[k] = projection.q
-        others = [int(count) for k, count in enumerate(hits) if k not in guesses]
-        return Screening(tuple(guesses.values()), tuple(int(hits[k]) for k in guesses), tuple(others), self._hops)
+        values = hits_by_value(self.ends.merit, self.ends.tag == 0)
+        partial = not all(isinstance(c, ExpressionConstraint) for c in self._problem.constraints)
+        return Screening(tuple(guesses.values()), tuple(int(hits[k]) for k in guesses), values, partial, self._hops)
 
     def _optima(self, most: int | None = None) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
         """Return the indices of distinct ends, best first, and for each end the position of its optimum in them."""
@@ -126,7 +132,7 @@ class _Search:
         leaders, label = list[int](), np.full(len(merit), -1)
         for k in np.argsort(merit, kind="stable"):
             near = np.linalg.norm(points[leaders] - points[k], axis=1) < _SAME
-            near &= merit[k] - merit[leaders] < _EQUAL
+            near &= merit[k] - merit[leaders] < SAME_VALUE
             if near.any():
                 label[k] = int(near.argmax())
                 continue

@@ -5,23 +5,30 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import ArrayLike
+
 # If no start was alone at its optimum, at most this number of starts in N lead elsewhere, with a confidence of 95 %
 # (rule of three).
 _RULE_OF_THREE = 3
+# Difference of two objectives, divided by the objective, up to which they count as one.
+SAME_VALUE = 5e-3
 
 
 @dataclass(frozen=True)
 class SearchEstimate:
-    """What a search reached, and what it may have missed.
+    """What a search reached, and what it may have missed.  Optima with equal objectives count as one.
 
     Attributes:
         method: ``adaptive`` or ``multistart``.
-        starts: Number of starts at random postures and at the given posture, without hops.
+        starts: Number of starts at random postures, without hops.
         hops: Number of starts at changed postures of the best optima.
-        optima: Number of distinct optima that starts or hops reached.
+        optima: Number of distinct objectives that starts or hops reached.
         hits_of_best: Number of starts that reached the best objective; 0 if only hops reached it.
-        unseen_share: Estimated share of further starts that would lead to an optimum not seen yet.
-        estimated_optima: Estimated number of optima, seen and unseen.
+        unseen_share: Estimated share of further starts that would lead to an objective not seen yet.
+        estimated_optima: Estimated number of objectives, seen and unseen.
+        bound: Whether the share is probably too high, because some starts were stopped early.
+        partial: Whether the starts ignored some constraints, such as clearances.
     """
 
     method: str
@@ -31,25 +38,30 @@ class SearchEstimate:
     hits_of_best: int
     unseen_share: float
     estimated_optima: float
+    bound: bool
+    partial: bool
 
     @staticmethod
-    def of(method: str, hits: Sequence[int], hits_of_best: int, hops: int = 0) -> SearchEstimate:
-        """Estimate from the number of starts at each optimum; optima that only hops reached have no hits."""
-        starts = sum(hits)
-        return SearchEstimate(
-            method, starts, hops, len(hits), hits_of_best, unseen_share(hits), estimated_optima(hits)
-        )
+    def of(
+        method: str, hits: Sequence[int], hits_of_best: int, hops: int = 0, bound: bool = False, partial: bool = False
+    ) -> SearchEstimate:
+        """Estimate from the number of starts at each objective; objectives that only hops reached have no hits."""
+        share, optima = unseen_share(hits), estimated_optima(hits)
+        return SearchEstimate(method, sum(hits), hops, len(hits), hits_of_best, share, optima, bound, partial)
 
     @property
     def line(self) -> str:
         """One sentence for users."""
-        optima = "1 optimum" if self.optima == 1 else f"{self.optima} optima"
+        optima = "one objective" if self.optima == 1 else f"{self.optima} different objectives"
         times = {0: "reached by hops only", 1: "hit once"}.get(self.hits_of_best, f"hit {self.hits_of_best} times")
         most = min(1.0, _RULE_OF_THREE / max(self.starts, 1))
-        elsewhere = f"about {_percent(self.unseen_share)}" if self.unseen_share else f"fewer than {_percent(most)}"
+        near = "at most about" if self.bound else "about"
+        elsewhere = f"{near} {_percent(self.unseen_share)}" if self.unseen_share else f"fewer than {_percent(most)}"
         hops = f" and {self.hops} hops" if self.hops else ""
         starts = "1 start" if self.starts == 1 else f"{self.starts} starts"
-        return f"{starts}{hops}: {optima}, the best {times}; {elsewhere} of the starts would lead elsewhere"
+        ignored = " if they ignore clearances and loads" if self.partial else ""
+        reached = f"{starts}{hops} reached optima with {optima}, the best {times}"
+        return f"{reached}; {elsewhere} of further starts would lead to another objective{ignored}"
 
     def to_dict(self) -> dict[str, object]:
         """Return the block ``search`` of ``result.json``."""
@@ -58,6 +70,21 @@ class SearchEstimate:
 
 def _percent(share: float) -> str:
     return f"{100 * share:.{0 if share >= 0.1 else 1}f} %"
+
+
+def hits_by_value(values: ArrayLike, hits: ArrayLike) -> tuple[int, ...]:
+    """Return the number of hits of each distinct value, the least value first.
+
+    ``values`` and ``hits`` have shape (N,).  Values that exceed the least value of a group by at most
+    :data:`SAME_VALUE` belong to the group.
+    """
+    groups = list[tuple[float, int]]()
+    for value, count in sorted(zip(np.asarray(values, dtype=float), np.asarray(hits, dtype=int), strict=True)):
+        if groups and value <= groups[-1][0] + SAME_VALUE:
+            groups[-1] = groups[-1][0], groups[-1][1] + int(count)
+        else:
+            groups.append((value, int(count)))
+    return tuple(count for _, count in groups)
 
 
 def unseen_share(hits: Sequence[int]) -> float:
