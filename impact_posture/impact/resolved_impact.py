@@ -94,7 +94,7 @@ def choose_objective(settings: ImpactSettings, *, several: bool) -> tuple[Object
         return settings.objective, ""
     kind, reason = _automatic(settings, several=several)
     given = ", ".join(f"`{name}`" for name in stated)
-    return kind, reason if settings.objective == "auto" else f"{reason} (auto, because {given} is given)"
+    return kind, reason if settings.objective == "auto" else f"{reason} (auto, because of {given})"
 
 
 def _automatic(settings: ImpactSettings, *, several: bool) -> tuple[ObjectiveKind, str]:

@@ -337,7 +337,7 @@ def test_a_stated_speed_friction_or_elasticity_selects_auto(
     """Also a stated number that equals the default.  The problem that is written has the same objective."""
     prepared = prepare(make_settings({"robot": "panda", **NORMAL, **more}))
     assert prepared.impact.objective.kind == kind
-    assert ("(auto, because `" in prepared.impact.choice) == (bool(more) and "objective" not in more)
+    assert ("(auto, because of `" in prepared.impact.choice) == (bool(more) and "objective" not in more)
     path = tmp_path / "problem.toml"
     path.write_text(dump_settings(resolved_settings(prepared)))
     again = prepare(read_settings(path))

@@ -123,6 +123,11 @@ class ContactStiffness:
         return {**numbers, "material": self.material or None}
 
 
+def milliseconds(time: float) -> str:
+    """Return a time in s as text in ms with two digits, without an exponent."""
+    return f"{float(f'{1e3 * time:.2g}'):g} ms"
+
+
 def hertz_stiffness(material: str) -> float:
     """Return ``κ = (4/3) E* √R``, N/m^{3/2}, for a steel tip that touches a material (Johnson 1985, §4.2)."""
     inverse = sum((1 - nu**2) / E for E, nu in (MATERIALS["steel"], MATERIALS[material]))

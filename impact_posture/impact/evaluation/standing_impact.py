@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from impact_posture.config.json_block import json_block
+from impact_posture.impact.elasticity.contact_compression import milliseconds
 from impact_posture.impact.evaluation.velocity_jump import Jump, weighed_jump
 from impact_posture.impact.friction.unilateral_impact import StandingFeet, longest_lifting_time, unilateral_impact
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
@@ -45,13 +46,13 @@ class StandingImpact:
     @property
     def fact(self) -> str:
         """Effect of the impact on the feet, in words."""
-        counted = f" with the weight over the {1e3 * self.time:.2g} ms of the contact" if self.time > 0 else ""
+        counted = f" with the weight over the {milliseconds(self.time)} of the contact" if self.time > 0 else ""
         moved = (("lifts or tips", self.lifts), ("slides", self.slides))
         does = [f"{verb} {', '.join(frames)}" for verb, frames in moved if frames]
         if not does:
             return f"the feet stay{counted}"
         shorter = (
-            "" if self.holding_time is None else f" if the contact is shorter than {1e3 * self.holding_time:.2g} ms"
+            "" if self.holding_time is None else f" if the contact is shorter than {milliseconds(self.holding_time)}"
         )
         return f"the impact {' and '.join(does)}{counted}{shorter}"
 

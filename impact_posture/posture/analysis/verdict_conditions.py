@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from itertools import chain
 
 from impact_posture.config.json_block import json_block
+from impact_posture.impact.elasticity.contact_compression import milliseconds
 from impact_posture.impact.evaluation.evaluation import Evaluation
 from impact_posture.impact.resolved_impact import ResolvedImpact
 
@@ -110,8 +111,9 @@ def _long(impact: ResolvedImpact, before: Evaluation, after: Evaluation) -> Iter
     times = [side.compression.time or 0.0 for side in (before, after) if side.compression is not None]
     time = max(times, default=0.0)
     if impact.speed * time > LONG_TRAVEL:
-        moved = f"the robot moves during the {1e3 * time:.2g} ms of the contact"
-        yield Condition("contact time", f"{moved}, which changes the predicted jumps by up to 20 %")
+        travel = f"the surface by {1e3 * impact.speed * time:.0f} mm"
+        moved = f"the robot moves during the {milliseconds(time)} of the contact ({travel})"
+        yield Condition("contact time", f"{moved}, which the numbers neglect")
 
 
 def _start(known: Circumstances) -> Iterator[Condition]:
