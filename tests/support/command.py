@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import atexit
 import contextlib
 import gc
 import logging
@@ -151,8 +150,6 @@ def _command(
     """Run the command with the streams, folder, signal handlers and warnings that a new program would have."""
     # Without this call, the garbage collector would write to memory that is shared with the test, and copy it.
     gc.freeze()
-    # The exit handlers of the tests would delete the temporary folders of the tests.
-    atexit._clear()
     # A new program starts without cached controllers.
     impact_posture.experiment.jobs.controller_factory.cache_clear()
     os.dup2(out, 1)
