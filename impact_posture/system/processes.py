@@ -7,10 +7,10 @@ import multiprocessing
 import os
 import signal
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager, suppress
+from multiprocessing.process import BaseProcess
 from typing import Any, NoReturn, TypeVar, cast
 
 from impact_posture.errors import WorkerDied
@@ -30,8 +30,6 @@ _UNFINISHED: list[tuple[int, Callable[[], None]]] = []
 # Number of active :func:`signals_held` blocks, and the ``leave`` functions of signals that arrived in these blocks.
 _HELD = [0]
 _LATER: list[Callable[[], None]] = []
-# Number of hundredths of a second for which a copy may remove its temporary folders before it is killed.
-_PATIENCE = 100
 
 _PR_SET_PDEATHSIG = 1
 
@@ -68,7 +66,7 @@ def signals_held() -> Iterator[None]:
 
 
 def end_early(leave: Callable[[], None]) -> None:
-    """Kill the workers, call the functions of :func:`undone`, newest first, then call ``leave``.
+    """End the workers and copies, call the functions of :func:`undone`, newest first, then call ``leave``.
 
     A signal handler calls this function, and ``leave`` calls ``os._exit``.  An exception is not enough, because the
     wrappers of C++ libraries treat a ``KeyboardInterrupt`` as a failed conversion and continue.
@@ -76,16 +74,22 @@ def end_early(leave: Callable[[], None]) -> None:
     if _HELD[0]:
         _LATER.append(leave)
         return
-    children = multiprocessing.active_children()
-    for child in children:
-        child.kill()
-    for child in children:
-        child.join(1)
+    _end(multiprocessing.active_children())
     for pid, undo in reversed(_UNFINISHED):
         if pid == os.getpid():
             with suppress(Exception):
                 undo()
     leave()
+
+
+def _end(children: Sequence[BaseProcess]) -> None:
+    """Terminate processes, and kill those that still run after a second each."""
+    for child in children:
+        child.terminate()
+    for child in children:
+        child.join(1)
+        child.kill()
+        child.join(1)
 
 
 def _worker(index: int) -> tuple[int, Any]:
@@ -143,28 +147,10 @@ def fork_call(function: Callable[[], _Result]) -> Iterator[Callable[[], _Result]
     if not hasattr(os, "fork"):
         raise OSError("the system cannot fork")
     receiver, sender = multiprocessing.Pipe(duplex=False)
+    copy = multiprocessing.get_context("fork").Process(target=_copy, args=(function, receiver, sender, os.getpid()))
     with signals_held():
-        parent, child = os.getpid(), os.fork()
-        if child == 0:
-            receiver.close()
-            depend(parent)
-            # With SIGTERM, the copy removes its temporary folders before it ends.
-            _HELD[0] = 0
-            multiprocessing.process._children.clear()  # type: ignore[attr-defined]
-            signal.signal(signal.SIGTERM, lambda *_: end_early(lambda: os._exit(1)))
-            _send_result(function, sender)
+        copy.start()
     sender.close()
-
-    def kill() -> None:
-        # Kill only a child that still runs, because the system may give the id of an ended child to another process.
-        with suppress(ChildProcessError):
-            for _ in range(_PATIENCE):
-                if os.waitpid(child, os.WNOHANG) != (0, 0):
-                    return
-                os.kill(child, signal.SIGTERM)
-                time.sleep(0.01)
-            os.kill(child, signal.SIGKILL)
-            os.waitpid(child, 0)
 
     def collect() -> _Result:
         try:
@@ -175,12 +161,20 @@ def fork_call(function: Callable[[], _Result]) -> Iterator[Callable[[], _Result]
             raise error
         return cast(_Result, result)
 
-    with undone(kill), receiver:
-        yield collect
+    try:
+        with receiver:
+            yield collect
+    finally:
+        _end([copy])
 
 
-def _send_result(function: Callable[[], Any], sender: Any) -> NoReturn:
+def _copy(function: Callable[[], Any], receiver: Any, sender: Any, parent: int) -> NoReturn:
     """Send the result or the error of ``function`` to the parent process, and end the process without clean-up."""
+    receiver.close()
+    depend(parent)
+    # With SIGTERM, the copy removes its temporary folders before it ends.
+    _HELD[0] = 0
+    signal.signal(signal.SIGTERM, lambda *_: end_early(lambda: os._exit(1)))
     try:
         try:
             sender.send((None, function()))
