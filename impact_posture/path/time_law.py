@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from itertools import pairwise
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,33 +25,19 @@ class TimeLaw:
     """The progress ``s(t)`` of a motion, from 0 at ``t = 0`` to 1 at the end.
 
     Attributes:
-        progress: Polynomials of ``s`` over time, which end one second after the motion.
+        progress: Polynomials of ``s`` over time.
         duration: Duration, s.
-        ramp: Time ``w`` over which ``s`` is averaged, s: ``(1/w) ∫ s dt`` from ``t − w`` to ``t``.  Zero means no
-            averaging.
+        bends: Times at which ``s̈`` begins or ends to change, s.
     """
 
     progress: PPoly
     duration: float
-    ramp: float = 0.0
+    bends: Array = field(default_factory=lambda: np.zeros(0))
 
     def at(self, t: Array) -> tuple[Array, Array, Array]:
         """Return ``s``, ``ṡ`` and ``s̈`` at times, shape (n,)."""
-        if not self.ramp:
-            s, ds, dds = (self.progress(t, order) for order in range(3))
-            return s, ds, dds
-        before = [self.progress.antiderivative(), self.progress, self.progress.derivative()]
-        s, ds, dds = ((each(t) - each(t - self.ramp)) / self.ramp for each in before)
+        s, ds, dds = (self.progress(t, order) for order in range(3))
         return s, ds, dds
-
-    @property
-    def bends(self) -> Array:
-        """Times at which ``s̈`` begins or ends to change, s."""
-        breaks = self.progress.x
-        curvature = 2 * self.progress.c[-3]
-        jump = np.abs(np.diff(curvature))
-        at = breaks[1:-1][jump > _BEND * jump.max(initial=0.0)]
-        return np.unique(np.concatenate([at, at + self.ramp]).round(DIGITS)) if self.ramp else np.zeros(0)
 
 
 def polynomial(coefficients: Array, duration: float) -> TimeLaw:
@@ -73,14 +58,15 @@ def stepped(s: Array, rates: Array) -> TimeLaw:
     """
     from scipy.interpolate import PPoly
 
-    passed = np.array([2 * d / (a + b) for d, (a, b) in zip(np.diff(s), pairwise(rates), strict=True)])
-    ends = np.concatenate([[0.0], np.cumsum(passed)])
-    c = np.array([np.diff(rates) / passed / 2, rates[:-1], s[:-1]])
-    rest = np.zeros((3, 1))
-    c = np.hstack([rest, c, np.array([[0.0], [0.0], [1.0]])])
-    ramp = min(RAMP, _SHARE * float(ends[-1]))
-    duration = _whole(float(ends[-1]) + ramp)
-    return TimeLaw(PPoly(c, np.concatenate([[-1.0], ends, [ends[-1] + 1.0]])), duration, duration - float(ends[-1]))
+    ends = np.append(0.0, np.cumsum(2 * np.diff(s) / (rates[1:] + rates[:-1])))
+    duration = _whole(float(ends[-1]) + min(RAMP, _SHARE * float(ends[-1])))
+    ramp = duration - float(ends[-1])
+    t = np.unique([*ends, *(ends + ramp)])
+    dds = (np.interp(t, ends, rates) - np.interp(t - ramp, ends, rates)) / ramp
+    progress = PPoly(np.array([np.diff(dds) / np.diff(t), dds[:-1]]), t).antiderivative(2)
+    jumps = np.abs(np.diff(np.diff(rates) / np.diff(ends), prepend=0.0, append=0.0))
+    at = ends[jumps > _BEND * jumps.max()]
+    return TimeLaw(progress, duration, np.unique(np.append(at, at + ramp).round(DIGITS)))
 
 
 def _whole(duration: float) -> float:
