@@ -9,13 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from docs.studies.verdict.impact_simulation import ImpactSimulation, Point, SimulatedImpact, Surface
 from impact_posture.config.problem_settings import ProblemSettings
 from impact_posture.config.table_validation import validate
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.impact.effective_mass_objective import EffectiveMassObjective
 from impact_posture.impact.elasticity.contact_compression import ContactStiffness, compression
 from impact_posture.impact.friction.coulomb_impact import coulomb_impact
-from impact_posture.impact.impact_contact import ImpactContact
+from impact_posture.impact.impact_contact import ImpactContact, point_on
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.posture.analysis.verdict import verdict
 from impact_posture.posture.constraints.impact_bounds import ImpactBounds
@@ -25,15 +26,13 @@ from impact_posture.posture.search.growing_search import feasible
 from impact_posture.posture.search.multistart import solve
 from tests.support.command import refused, run
 from tests.support.helpers import (
+    Vector,
     central_gradient,
-    frame_jacobian,
-    mass_matrix,
     random_configurations,
     relative,
     robot,
 )
 from tests.support.settings import make_settings
-from tests.support.spring_contact import spring_impact
 
 FRAMES = {"tilthex_arm": "ee", "panda": "panda_hand_tcp", "ur5": "tool0"}
 
@@ -42,26 +41,31 @@ def struck(name: str, friction: float, normal: tuple[float, float, float] = (0.3
     return WorstCaseObjective(robot(name), ImpactContact(FRAMES[name], normal, friction=friction))
 
 
+def simulated(objective: WorstCaseObjective, q: Vector, surface: Surface) -> SimulatedImpact:
+    """Simulate the impact of a robot whose mass matrix and Jacobian do not change."""
+    point = point_on(objective.robot, objective.contact.frame, objective.contact.offset)
+    simulation = ImpactSimulation(objective.robot.model, q, Point(point.joint, point.position), still=True)
+    return simulation.run(surface)
+
+
 @pytest.mark.parametrize("name", FRAMES)
 @pytest.mark.parametrize("friction", [0.0, 0.2, 3.0])
 def test_force_and_time_equal_an_integrated_contact_with_friction(name: str, friction: float) -> None:
     objective, speed, seen = struck(name, friction), 0.7, set()
     (q,) = random_configurations(objective.robot.model, 1, name, "force")
     n = np.array(objective.contact.normal)
-    model = objective.robot.model
-    J = frame_jacobian(model, q, objective.robot.frame_id(objective.contact.frame))[:3]
     for contact, power in ((ContactStiffness(linear=2e5), 1.0), (ContactStiffness(hertz=3e7), 1.5)):
         stiffness = contact.linear or contact.hertz or 0.0
-        stepped = spring_impact(mass_matrix(model, q), J, n, friction, stiffness, speed, power=power)
+        stepped = simulated(objective, q, Surface(n, speed, stiffness, friction, power))
         predicted = compression(objective, q, speed, contact)
         assert predicted is not None and predicted.peak_force is not None and predicted.time is not None
         assert predicted.peak_force == pytest.approx(stepped.force, rel=1e-3)
         assert predicted.time == pytest.approx(stepped.time, rel=1e-3)
-        assert predicted.mass * speed == pytest.approx(stepped.normal_impulse, rel=1e-3)
+        assert predicted.mass * speed == pytest.approx(n @ stepped.impulse, rel=1e-3)
         impact = coulomb_impact(objective.oracle, q)
-        assert relative(speed * impact.jump, stepped.velocity) < 1e-3
-        assert impact.sticks == stepped.sticks
-        seen.add(stepped.sticks)
+        assert relative(speed * impact.jump, stepped.jump) < 1e-3
+        assert impact.sticks == (stepped.slip < 1e-5 * speed)
+        seen.add(impact.sticks)
     assert seen == {friction == 3.0}
     G = objective.oracle.quantities(q).G
     assert (predicted.mass * G == pytest.approx(1)) == (friction == 0.0)
@@ -72,11 +76,8 @@ def test_the_force_of_the_first_example_grows() -> None:
     settings = validate(ProblemSettings, {"robot": "tilthex_arm", "frame": "ee", "normal": (0, 0, 1)}, "options")
     prepared = prepare(settings)
     solution = solve(prepared.problem, starts=4, compile="never")
-    objective, model = prepared.impact.objective, prepared.impact.robot.model
-    forces = []
-    for q in (solution.initial, solution.q):
-        J = frame_jacobian(model, q, prepared.impact.robot.frame_id("ee"))[:3]
-        forces.append(spring_impact(mass_matrix(model, q), J, np.array([0.0, 0, 1]), 0.7, 1e5, 1.0).force)
+    objective, surface = prepared.impact.objective, Surface(np.array([0.0, 0, 1]), 1.0, 1e5, 0.7)
+    forces = [simulated(objective, q, surface).force for q in (solution.initial, solution.q)]
     told = verdict(prepared.impact, *map(prepared.impact.evaluate, (solution.initial, solution.q)))
     assert told.peak_force == pytest.approx(forces[1] / forces[0] - 1, abs=0.01)
     assert forces[1] / forces[0] == pytest.approx(1.51, abs=0.02)
@@ -114,9 +115,8 @@ def test_no_posture_exceeds_a_bound_on_the_simulated_force(friction: float) -> N
     bounded = prepare(make_settings({**task, "max_force": 0.9 * start.peak_force}))
     solution = solve(bounded.problem, starts=4, compile="never")
     assert solution.certificate.holds()
-    model, impact = bounded.impact.robot.model, bounded.impact
-    J = frame_jacobian(model, solution.q, impact.robot.frame_id(impact.contact.frame), impact.contact.offset)[:3]
-    stepped = spring_impact(mass_matrix(model, solution.q), J, np.array([0.0, 0, 1]), friction, 1e5, 1.0)
+    surface = Surface(np.array([0.0, 0, 1]), 1.0, 1e5, friction)
+    stepped = simulated(bounded.impact.objective, solution.q, surface)
     assert stepped.force <= 0.9 * start.peak_force * 1.001
 
 

@@ -47,14 +47,16 @@ class Surface:
     Attributes:
         normal: Unit normal towards the robot, world axes, shape (3,).
         speed: Speed along the normal, m/s.
-        stiffness: Stiffness of the spring between surface and robot, N/m.
+        stiffness: Stiffness of the spring between surface and robot, N/m^power.
         friction: Coulomb coefficient of the surface and of the ground.
+        power: Exponent of the spring force, ``stiffness · depth^power``; 1 if the robot has feet.
     """
 
     normal: Vector
     speed: float
     stiffness: float
     friction: float
+    power: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +132,6 @@ class ImpactSimulation:
         axes = np.vstack([np.linalg.svd(n[None, :])[2][1:], n])
         count = 1 if self.held else len(self.points)
         k = np.full(count, _STIFFER * surface.stiffness)
-        k[0] = surface.stiffness
         friction, moving = np.full(count, surface.friction), np.zeros(3 * count)
         moving[2] = surface.speed
         q, v, p, depth = self.q, np.zeros(self.model.nv), np.zeros(3 * count), np.zeros(count)
@@ -139,10 +140,11 @@ class ImpactSimulation:
         fastest = np.zeros(count - 1)
         M, J, feet = self._contacts(q, axes, count)
         X = _respond(M, feet, J.T)
-        dt = min(_LONGEST, np.pi / 2 / np.sqrt(surface.stiffness * float(J[2] @ X[:, 2])) / _STEPS)
+        power = surface.power
+        deepest = (surface.speed**2 * (power + 1) / 2 / (surface.stiffness * (J[2] @ X[:, 2]))) ** (1 / (power + 1))
+        dt = min(_LONGEST, np.pi / 2 * float(deepest) / surface.speed / _STEPS)
         # The ground pushes by the depth at the end of the step and by damping, the surface by the mean depth.
         s = 1 / ((1 + _DAMPED) * dt**2 * k)
-        s[0] = 4 / (dt**2 * k[0])
         for step in range(_PATIENCE * _STEPS):
             if step and not self.still:
                 M, J, feet = self._contacts(q, axes, count)
@@ -150,6 +152,8 @@ class ImpactSimulation:
             h = self._weight if self.still else pin.nonLinearEffects(self.model, self._data, q, v)
             free = v + dt * _respond(M, feet, self._torques - h)
             before = J @ v - moving
+            k[0] = surface.stiffness * (depth[0] - before[2] * dt / 2) ** (power - 1)
+            s[0] = 4 / (dt**2 * k[0])
             d = dt * k * s * depth
             d[0] = 4 / dt * depth[0] - before[2]
             p, solved = CoulombStep(J @ X, J @ free - moving, s, d, friction).solve(p)
@@ -174,7 +178,7 @@ class ImpactSimulation:
         return SimulatedImpact(
             jump=v,
             impulse=axes.T @ impulse,
-            force=float(k[0] * depth[0]),
+            force=float(surface.stiffness * depth[0] ** power),
             slip=float(np.linalg.norm(end[:2])),
             time=time,
             feet=fastest,
@@ -182,7 +186,7 @@ class ImpactSimulation:
             unsolved=unsolved,
             q=q,
             work=work,
-            stored=float(k[0] * depth[0] ** 2 / 2),
+            stored=float(surface.stiffness * depth[0] ** (power + 1) / (power + 1)),
             lost=lost,
         )
 

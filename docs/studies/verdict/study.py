@@ -161,11 +161,8 @@ class Row:
 
     def changes(self, number: str) -> tuple[float, float] | None:
         """Return the predicted and the simulated relative change of a number."""
-        if getattr(self.before.predicted, number) is None:
-            return None
-        sides = ("predicted", "simulated")
-        first, second = ([getattr(getattr(p, side), number) for side in sides] for p in (self.before, self.after))
-        return second[0] / first[0] - 1, second[1] / first[1] - 1
+        first, second = self.before.values(number), self.after.values(number)
+        return None if first[0] is None else (second[0] / first[0] - 1, second[1] / first[1] - 1)
 
 
 @dataclass(frozen=True)
