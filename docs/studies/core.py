@@ -62,7 +62,6 @@ STUDIES = {
     study.name: study
     for study in (
         Study("solve", "solve", "solve and build times, and the exported gradient with feet; random starts", 20),
-        Study("optima", "solve:optima", "whether 16 starts reach the optimum of many starts", 500, page=False),
         Study(
             "answer", "answer", "optimize until its answer and until its end, beside another program", 5, page=False
         ),

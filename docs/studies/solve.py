@@ -15,7 +15,6 @@ from docs.studies.exported import feet
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem
 from impact_posture.posture.program.posture_nlp import PostureNLP, build_nlp
 from impact_posture.posture.search.growing_search import run_start
-from impact_posture.posture.search.multistart import solve
 from impact_posture.system.toolchain import find_compiler
 
 # Goals for the time of a solve from one start, ms.
@@ -81,17 +80,3 @@ def _built(problem: ConstrainedProblem, mode: str) -> tuple[PostureNLP, float, f
     began, busy = time.perf_counter(), sum(os.times()[:4])
     nlp = build_nlp(problem, compile="never" if mode == "interpreted" else "always")
     return nlp, time.perf_counter() - began, sum(os.times()[:4]) - busy
-
-
-def optima(request: Request) -> Iterator[str]:
-    """Yield a row for each case: the best objective of 16 starts, relative to the best objective of many starts."""
-    yield from (machine(), "")
-    rows = ([name, _above(name, request.count)] for name, ms in TARGETS_MS.items() if ms and request.only in name)
-    yield from table(["case", f"best of 16 above the best of {request.count}"], rows)
-
-
-def _above(name: str, many: int) -> str:
-    problem = CASES[name].problem()
-    solutions = (solve(problem, starts=16), solve(problem, starts=many, seed=7, compile="never"))
-    few, best = (min(optimum.objective for optimum in solution.optima) for solution in solutions)
-    return f"{few / best - 1:+.2%}"
