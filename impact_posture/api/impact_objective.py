@@ -106,10 +106,7 @@ class ImpactObjective(WorstCaseObjective):
             raise InputError("names no contact", where="contact", hint="give an ImpactContact")
         leading, *more = (_with_offset(robot, each) for each in (*contacts, *others))
         if contact_point == "front":
-            if posture is None or isinstance(posture, str):
-                q = read_posture(robot, posture)
-            else:
-                q = robot.check_posture(np.asarray(posture, dtype=float), where="posture")
+            q = read_posture(robot, posture)
             leading, *more = (at_front(robot, each, q, held_by_default(robot)) for each in (leading, *more))
         feet = _supports(robot, supports)
         for each in (leading, *more):

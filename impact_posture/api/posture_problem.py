@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from dataclasses import fields, replace
 from typing import Any
 
-import numpy as np
-
 from impact_posture.config.checked import checked
 from impact_posture.config.problem_settings import RESTITUTION, SPEED, ImpactSettings, ProblemSettings, RobotSettings
 from impact_posture.config.setting import stated
@@ -61,10 +59,9 @@ class PostureProblem:
         **task: Any,
     ) -> None:
         robot = objective.robot
+        q, name = read_posture(robot, posture), "a configuration"
         if posture is None or isinstance(posture, str):
-            q, name = read_posture(robot, posture), posture or robot.default_posture
-        else:
-            q, name = robot.check_posture(np.asarray(posture, dtype=float), where="posture"), "a configuration"
+            name = posture or robot.default_posture
         loaded = robot.settings or RobotSettings(robot=robot.source)
         values = {field.name: getattr(loaded, field.name) for field in fields(RobotSettings)}
         values |= {"restitution": restitution, "joint_model": robot.joint_model}

@@ -29,7 +29,7 @@ _FIXED = ", but the root is fixed, with the root link at the world's origin alon
 _NO_BASE = "remove the base and give `normal` in those axes, or use `root` free-flyer"
 
 
-def read_posture(robot: Robot, text: str | None, where: str = "posture") -> Array:
+def read_posture(robot: Robot, text: str | Array | Sequence[float] | None, where: str = "posture") -> Array:
     """Return the posture that ``text`` names, shape (nq,); check its length, quaternion and limits.
 
     Args:
@@ -37,7 +37,8 @@ def read_posture(robot: Robot, text: str | None, where: str = "posture") -> Arra
         text: Name of a posture of the robot, or a file: ``posture.json`` (``q`` in the order of ``joint_names``),
             ``{"base": [x, y, z, qx, qy, qz, qw], "joints": {name: value}}``, or a ``sensor_msgs/JointState`` in YAML
             (``name: [...]``, ``position: [...]``).  A continuous joint is given as an angle, rad.  Joints that the
-            file does not name stay as in the default posture.  ``None`` means the default posture.
+            file does not name stay as in the default posture.  ``None`` means the default posture.  A configuration,
+            shape (nq,), is only checked.
         where: Option or file, for error messages.
 
     Raises:
@@ -45,6 +46,8 @@ def read_posture(robot: Robot, text: str | None, where: str = "posture") -> Arra
         JointNotFound: The file names a joint that the robot does not have.
         PostureError: The file cannot be read, or is not a posture of this robot.
     """
+    if not (text is None or isinstance(text, str)):
+        return robot.check_posture(np.asarray(text, dtype=float), where=where)
     if text is None or text in robot.postures:
         return robot.check_posture(robot.posture(text), where=f"{where} {text or robot.default_posture}")
     path = posture_path(text)
