@@ -35,7 +35,7 @@ class Page:
     """Writes titles, lines and tables to standard output, and warnings and progress to standard error.
 
     Attributes:
-        json: Whether standard output is one JSON document.  Then there is no progress line.
+        json: Whether standard output is one JSON document, without a progress line.
         quiet: Whether to leave out warnings, the progress line and advice.
     """
 

@@ -59,7 +59,7 @@ class Interval:
 
 
 def without_noise(intervals: Iterable[Interval]) -> bool:
-    """Return whether all intervals are ``alike``, so the scenario has no noise; false if there are no intervals."""
+    """Return whether all intervals are ``alike``, so the scenario has no noise; false without intervals."""
     alike = [interval.alike for interval in intervals]
     return bool(alike) and all(alike)
 

@@ -109,7 +109,7 @@ class CompiledWorld:
 def compiled_world(world: World, tick: CompiledTick | None, count: int) -> CompiledWorld | None:
     """Return the C loop for a world after its reset, or ``None`` if Python must run the ticks.
 
-    Python runs the ticks if there is no C controller, or if the loop cannot be compiled, for example because the
+    Python runs the ticks without a C controller, or if the loop cannot be compiled, for example because the
     MuJoCo headers are missing.  Python also runs worlds with more than 64 rotors and worlds that :meth:`World.in_c`
     excludes.
     """

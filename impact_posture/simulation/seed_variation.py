@@ -78,7 +78,7 @@ def _start(setup: Setup, size: float, generator: np.random.Generator) -> Array:
 
 
 def stand(setup: Setup, q: Array) -> Array | None:
-    """Return the posture nearest to ``q`` whose feet are at their places; ``None`` if there is none.
+    """Return the posture nearest to ``q`` whose feet are at their places; ``None`` if none is reached.
 
     The center of mass stays above the support polygon.
     """

@@ -87,7 +87,7 @@ def _cheapest(qp: QP, units: Array, nearest: Array) -> Solved:
 
     Equations, and rows that violate their bounds, keep their values.  The cost is therefore minimized in the null
     space of these rows: ``z = nearest + W y``.  In the basis ``W``, the cost is a sum of squares.  All other bounds
-    hold.  Return ``nearest`` if there is no free direction or the solver failed.
+    hold.  Return ``nearest`` without a free direction, or if the solver failed.
     """
     values, rows = qp.values(nearest), np.vstack([np.eye(qp.n), qp.A]) * units
     size, lengths = max(1.0, float(np.max(np.abs(nearest / units)))), np.linalg.norm(rows, axis=1)

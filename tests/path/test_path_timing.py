@@ -133,7 +133,7 @@ def test_limits_hold_for_the_trajectory_as_a_robot_interpolates_it(
 
 
 def test_the_motion_between_rows_of_a_floating_base_has_the_twist_of_its_postures() -> None:
-    """The rows are those of ``q(t) = q₀ ⊕ t ν₀`` with ``t ↦ t + t²``, whose twist and acceleration are known."""
+    """The rows lie on ``q(t) = q₀ ⊕ t ν₀`` with ``t ↦ t + t²``, whose twist and acceleration are known."""
     model, h = robot("tilthex_arm").model, 1e-6
     start, twist = robot("tilthex_arm").posture(), rng("twist").normal(size=model.nv)
     t = np.linspace(0.0, 0.02, 3)

@@ -36,7 +36,7 @@ def of_export(objective: WorstCaseObjective) -> tuple[Operations, int | None]:
 
     A call runs only the blocks that its outputs need, so only the reachable part of the graph is counted.  In the
     second number, a vector instruction for all repeated limbs counts once, but each sine and cosine counts.  This
-    number is ``None`` if there are no repeated limbs.  Ignoring the order of sums changes the count by at most 1 %.
+    number is ``None`` without repeated limbs.  Ignoring the order of sums changes the count by at most 1 %.
     """
     exported = export_library([NamedObjective(objective, "kernel")])
     outputs = next(f.outputs for f in exported.functions if f.name == "eval")

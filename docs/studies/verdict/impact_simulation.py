@@ -97,7 +97,7 @@ class ImpactSimulation:
 
     Attributes:
         held: Whether the feet cannot move, as if they were glued to the ground.
-        still: Whether mass matrix and Jacobians stay those of the first posture.
+        still: Whether mass matrix and Jacobians stay as in the first posture.
         carried: Vertical forces that carry the weight at rest, N, shape (feet,).
         stands: Whether these forces balance the weight.
     """

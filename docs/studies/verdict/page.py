@@ -91,7 +91,7 @@ def _pairs(rows: Sequence[Row]) -> list[tuple[Row, str, Pair]]:
 
 
 def _reason(row: Row, pair: Pair, number: str) -> str | None:
-    """Return why a number may be beyond its bar; empty if there is no reason, ``None`` if it is within its bar."""
+    """Return why a number may be beyond its bar; empty without a reason, ``None`` if it is within its bar."""
     bar, error = NUMBERS[number][1], pair.error(number)
     if error is None or abs(error) <= bar:
         return None

@@ -3,7 +3,7 @@
 :func:`draw_all` writes the figures of a result.  :func:`figures_of_run`, :func:`figures_of_comparison` and
 :func:`bars_figure` return the figures of simulated runs.
 
-A function raises :class:`~impact_posture.errors.InputError` if there is no data for its figure, or if the runs belong
+A function raises :class:`~impact_posture.errors.InputError` without data for its figure, or if the runs belong
 to different scenarios or robots.  The package does not change the global state of pyplot and shows no window.
 """
 

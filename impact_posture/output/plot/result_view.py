@@ -112,7 +112,7 @@ class ResultView:
 
     @cached_property
     def free(self) -> tuple[ImpactQuantities, ...]:
-        """Quantities at the start and at the optimum, without the supports; empty if there are no supports."""
+        """Quantities at the start and at the optimum, without the supports; empty for a robot without supports."""
         if not self.objective.supports:
             return ()
         oracle = ImpactOracle(replace(self.objective.case, supports=()))

@@ -59,7 +59,7 @@ def whole(view: RunView) -> Clip:
 
 
 def first_impact(view: RunView) -> Clip | None:
-    """Return the clip of the first impact window with a margin, in ms; ``None`` if there is no impact."""
+    """Return the clip of the first impact window with a margin, in ms; ``None`` without an impact."""
     if not view.impacts:
         return None
     window = view.impacts[0]
@@ -70,7 +70,7 @@ def first_impact(view: RunView) -> Clip | None:
 
 
 def impacts(view: RunView) -> Clip:
-    """Return the clip of all impact windows with a margin; if there is no impact, the clip of the whole run."""
+    """Return the clip of all impact windows with a margin; without an impact, the clip of the whole run."""
     if not view.impacts:
         return whole(view)
     air = 0.2 if view.pushed else 0.5

@@ -146,7 +146,7 @@ class TargetTask(Task, Generic[Target]):
         """Return a copy of the output at ``state``, in the form of a target."""
 
     def reset(self, state: State) -> None:
-        """Set the target to the present output if there is no target yet.
+        """Set the target to the present output if the task has no target yet.
 
         Raises:
             InputError: The task requires a floating base, but the base is fixed.
