@@ -77,18 +77,6 @@ class ContactStability:
             return f"the feet slide at any friction below {_MOST_FRICTION:g}"
         return f"the feet stay with a friction coefficient of {self.friction:.2f} or more"
 
-    def fault(self, friction: float) -> str:
-        """Return a text on the feet that do not stay at this friction coefficient; empty if all feet stay."""
-        lifting = [foot.frame for foot in self.feet if foot.lifts]
-        if lifting:
-            return f"the impact lifts {', '.join(lifting)}"
-        if self.friction is None:
-            return "the impact tips a sole over its edge"
-        if self.friction > friction:
-            needed = f"more than {_MOST_FRICTION:g}" if self.friction > _MOST_FRICTION else f"{self.friction:.2f}"
-            return f"the impact slides them at friction {friction:g} ({needed} would hold them)"
-        return ""
-
     def to_dict(self) -> dict[str, object]:
         """Return JSON content."""
         finite = self.friction is not None and np.isfinite(self.friction)

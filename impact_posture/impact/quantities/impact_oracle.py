@@ -205,24 +205,13 @@ class ImpactOracle:
         Row k uses the adjoint ``M p − J_sᵀr = 0, J_s p + εr = −e_k``: ``∂f_k = pᵀ∂(Jᵀn + J_sᵀf − M a) + rᵀ∂(J_s a)``.
         """
         rows = len(self.at(q).Js)
-        return self._adjoint_rows(self.respond(np.zeros((self._nv, rows)), -np.eye(rows)))
-
-    def jump_gradient(self, q: Array) -> Array:
-        """Return the tangent Jacobian of ``a = M⁻¹Jᵀn``, shape (nv, nv).
-
-        Row k is ``∂a_k = p_kᵀ∂(Jᵀn − M a)`` with ``M p_k = e_k``.
-        """
-        self.at(q)
-        return self._adjoint_rows(self.respond(np.eye(self._nv)))
-
-    def _adjoint_rows(self, adjoints: ImpulseResponse) -> Array:
-        """Return ``pᵀ∂(Jᵀn + J_sᵀf − M a) + rᵀ∂(J_s a)`` as one row per adjoint ``p, r``, shape (k, nv)."""
         normal, x = np.array(self.contact.normal), self.respond(self.J.T @ self.n)
-        rows = [
+        adjoints = self.respond(np.zeros((self._nv, rows)), -np.eye(rows))
+        gradients = [
             self.coupling(normal, p, self.case.in_contact_frame) - self.inertial(ImpulseResponse(p, r), x)
             for p, r in zip(adjoints.a.T, adjoints.f.T, strict=True)
         ]
-        return np.array(rows).reshape(-1, self._nv)
+        return np.array(gradients).reshape(rows, self._nv)
 
     def coupling(self, direction: Array, v: Array, in_frame: bool) -> Array:
         """Return the tangent gradient of ``directionᵀJ(q) v`` for a constant ``v``, shape (nv,).
