@@ -72,7 +72,7 @@ def coulomb_jumps(objective: WorstCaseObjective, q: Array, speed: float) -> tupl
     friction = np.array([oracle.contact.friction for oracle in oracles])
     responses = objective.oracle.at(q).solve(J.T)
     B = J @ responses
-    p = contact_impulses((B + B.T) / 2, -normals, normals, friction)
+    p = contact_impulses(B, -normals, normals, friction)
     if p is None:
         return None
     after = (B @ p.ravel()).reshape(p.shape) - normals

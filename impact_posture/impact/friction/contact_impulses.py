@@ -28,6 +28,8 @@ def contact_impulses(B: Array, before: Array, normals: Array, friction: Array) -
     ``B`` has shape (3m, 3m).  ``before`` contains the velocities ``u⁻``, and ``normals`` the unit normals towards the
     robot, both in world axes with shape (m, 3).  ``friction`` has shape (m,).
     """
+    # ADMM needs a symmetric matrix, without rounding errors.
+    B = (B + B.T) / 2
     axes = [np.vstack([np.linalg.svd(n[None, :])[2][1:], n]) for n in normals]
     turned = np.zeros_like(B)
     for i, rows in enumerate(axes):

@@ -83,8 +83,7 @@ class StandingFeet:
             turns += [J[3:]] if support.kind == "surface" and not support.has_sole else []
             self.frames += [support.frame] * len(corners)
         self.normals = np.tile([0.0, 0.0, 1.0], (len(self.frames), 1))
-        nv = oracle.robot.nv
-        turning = np.vstack(turns) if turns else np.zeros((0, nv))
+        turning = np.vstack([np.zeros((0, oracle.robot.nv)), *turns])
         self.M, self.jacobian, self._turning = hold_locked(
             oracle.numeric.locked, oracle.numeric.mass_matrix(), np.vstack(rows), turning
         )
@@ -92,10 +91,7 @@ class StandingFeet:
 
     def respond(self, J: Array) -> Array:
         """Return ``M⁻¹Jᵀ``, where soles of unknown size do not turn; shape (nv, rows of ``J``)."""
-        free = np.linalg.solve(self.M, J.T)
-        if not len(self._turning):
-            return np.asarray(free)
-        fixed = np.linalg.solve(self.M, self._turning.T)
+        free, fixed = np.linalg.solve(self.M, J.T), np.linalg.solve(self.M, self._turning.T)
         inverse = np.linalg.pinv(self._turning @ fixed, rcond=_RANK, hermitian=True)
         return np.asarray(free - fixed @ inverse @ (self._turning @ free))
 
@@ -123,16 +119,26 @@ def unilateral_impact(
     """
     if time > 0 and feet.forces is None:
         return None
-    contacts = _Contacts(feet, hit)
+    # The hit contacts come first, followed by the contact points of the feet.
+    count, normals = len(hit), np.vstack([*(oracle.n for oracle in hit), feet.normals])
+    J = np.vstack([*(oracle.J for oracle in hit), feet.jacobian])
+    friction = np.array([*(oracle.contact.friction for oracle in hit), *[feet.friction] * len(feet.frames)])
+    responses = feet.respond(J)
+    B = J @ responses
     # The approach speed that is left after each step.
     left = speed * np.cos(np.pi / 2 * np.linspace(0, 1, _STEPS + 1)[1:]) if time > 0 else np.zeros(1)
-    jump, impulses = np.zeros(feet.M.shape[0]), np.zeros((len(hit), 3))
+    weight = np.zeros(normals.shape)
+    if time > 0 and feet.forces is not None:
+        weight[count:] = time / len(left) * feet.forces
+    jump, impulses = np.zeros(feet.M.shape[0]), np.zeros((count, 3))
     fastest, up = np.zeros(len(feet.frames)), np.zeros(len(feet.frames))
     for speed_left in left:
-        step = contacts.step(jump, speed, speed_left, time / len(left))
-        if step is None:
+        start = (J @ jump - B @ weight.ravel()).reshape(weight.shape)
+        start[:count] -= (speed - speed_left) * normals[:count]
+        P = contact_impulses(B, start, normals, friction)
+        if P is None:
             return None
-        jump, impulses = jump + step[0], impulses + step[1]
+        jump, impulses = jump + responses @ (P - weight).ravel(), impulses + P[:count]
         velocities = (feet.jacobian @ jump).reshape(-1, 3)
         fastest = np.maximum(fastest, np.linalg.norm(velocities, axis=1))
         up = np.maximum(up, velocities[:, 2])
@@ -141,29 +147,6 @@ def unilateral_impact(
     lifting = moves & (up > _MOVES * speed / np.sqrt(2))
     lifts, moving = (dict.fromkeys(np.array(feet.frames)[points].tolist()) for points in (lifting, moves))
     return UnilateralImpact(jump, impulses, tuple(lifts), tuple(frame for frame in moving if frame not in lifts))
-
-
-class _Contacts:
-    """The hit contacts, followed by the contact points of the feet, at one posture."""
-
-    def __init__(self, feet: StandingFeet, hit: Sequence[ImpactOracle]) -> None:
-        self._feet, self._count = feet, len(hit)
-        self._J = np.vstack([*(oracle.J for oracle in hit), feet.jacobian])
-        self._normals = np.vstack([*(oracle.n for oracle in hit), feet.normals])
-        self._friction = np.array([*(oracle.contact.friction for oracle in hit), *[feet.friction] * len(feet.frames)])
-        self._responses = feet.respond(self._J)
-        B = self._J @ self._responses
-        self._B = (B + B.T) / 2
-
-    def step(self, jump: Array, speed: float, speed_left: float, time: float) -> tuple[Array, Array] | None:
-        """Return the change of the jump and the impulses at the hit contacts, until ``speed_left`` is left."""
-        weight = np.zeros(self._normals.shape)
-        if time > 0 and self._feet.forces is not None:
-            weight[self._count :] = time * self._feet.forces
-        start = (self._J @ jump - self._B @ weight.ravel()).reshape(weight.shape)
-        start[: self._count] -= (speed - speed_left) * self._normals[: self._count]
-        P = contact_impulses(self._B, start, self._normals, self._friction)
-        return None if P is None else (self._responses @ (P - weight).ravel(), P[: self._count])
 
 
 def longest_lifting_time(feet: StandingFeet, hit: Sequence[ImpactOracle], speed: float, most: float = 1.0) -> float:
