@@ -9,19 +9,20 @@ descents ignore them.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from impact_posture.posture.manifold.constraint_manifold import ConstraintManifold, right_inverse
+from impact_posture.posture.manifold.constraint_manifold import ConstraintManifold, right_inverse, times
 from impact_posture.system.arrays import Array
 
 # Residual (m, rad) below which a posture satisfies the equalities, and the residual up to which a step is accepted.
 _SATISFIED, _DRIFT = 1e-6, 1e-4
 # Number of Gauss–Newton steps from a drawn posture, and after a step of a descent.
 _PROJECTING, _RETURNING = 15, 2
-# Longest step (rad, m), longest Gauss–Newton step, and the step below which a descent cannot continue.
-_LONGEST, _LONGEST_RETURN, _SHORTEST = 0.6, 0.5, 1e-6
+# Longest step (rad, m), and the step below which a descent cannot continue.
+_LONGEST, _SHORTEST = 0.6, 1e-6
 # Share of the predicted decrease that a step must reach, and the factor that shortens a rejected step.
 _SUFFICIENT, _SHORTER = 1e-4, 0.3
 # A descent ends if the next step would lower the merit by less than this, or after this number of steps.
@@ -33,42 +34,6 @@ _CURVED, _DOWNHILL = 1e-3, 1e-2
 
 
 @dataclass
-class _State:
-    """Descents under way: one row for each.
-
-    Attributes:
-        x: Postures, shape (N, nx).
-        merit: Value of :meth:`ConstraintManifold.merit`, shape (N,).
-        gradient: Its gradient along the manifold and the limits, shape (N, nv).
-        direction: Direction of the next step, shape (N, nv).
-        hessian: Estimated inverse Hessian, shape (N, nv, nv).
-        fresh: Whether the Hessian is the identity matrix, shape (N,).
-        length: Share of the direction to try, shape (N,).
-        age: Number of steps, shape (N,).
-        tag: Integer that the caller gave to the posture, shape (N,).
-    """
-
-    x: Array
-    merit: Array
-    gradient: Array
-    direction: Array
-    hessian: Array
-    fresh: NDArray[np.bool_]
-    length: Array
-    age: NDArray[np.int_]
-    tag: NDArray[np.int_]
-
-    def taken(self, rows: NDArray[np.bool_]) -> _State:
-        """Return the descents of a mask."""
-        return _State(*[getattr(self, field.name)[rows] for field in fields(self)])
-
-    def joined(self, other: _State) -> _State:
-        """Return the descents of both."""
-        pairs = ((getattr(self, field.name), getattr(other, field.name)) for field in fields(self))
-        return _State(*[np.concatenate(pair) for pair in pairs])
-
-
-@dataclass(frozen=True)
 class Ends:
     """Postures where descents ended, shape (N, nx), with the merit and the tag of each."""
 
@@ -76,9 +41,38 @@ class Ends:
     merit: Array
     tag: NDArray[np.int_]
 
-    def joined(self, other: Ends) -> Ends:
-        """Return the ends of both."""
-        return Ends(*[np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)])
+    def taken(self, rows: NDArray[np.bool_]) -> Self:
+        """Return the rows of a mask."""
+        return type(self)(*[getattr(self, field.name)[rows] for field in fields(self)])
+
+    def joined(self, other: Self) -> Self:
+        """Return the rows of both."""
+        pairs = ((getattr(self, field.name), getattr(other, field.name)) for field in fields(self))
+        return type(self)(*[np.concatenate(pair) for pair in pairs])
+
+
+@dataclass
+class _State(Ends):
+    """Descents under way: one row for each.
+
+    Attributes:
+        x: Postures, shape (N, nx).
+        merit: Value of :meth:`ConstraintManifold.merit`, shape (N,).
+        tag: Integer that the caller gave to the posture, shape (N,).
+        gradient: Gradient of the merit along the manifold and the limits, shape (N, nv).
+        direction: Direction of the next step, shape (N, nv).
+        hessian: Estimated inverse Hessian, shape (N, nv, nv).
+        fresh: Whether the Hessian is the identity matrix, shape (N,).
+        length: Share of the direction to try, shape (N,).
+        age: Number of steps, shape (N,).
+    """
+
+    gradient: Array
+    direction: Array
+    hessian: Array
+    fresh: NDArray[np.bool_]
+    length: Array
+    age: NDArray[np.int_]
 
 
 class BatchDescent:
@@ -86,8 +80,6 @@ class BatchDescent:
 
     def __init__(self, manifold: ConstraintManifold) -> None:
         self.manifold = manifold
-        self._in_v, self._in_x = (np.array(places, dtype=int) for places in manifold.chart.bounded)
-        self._low, self._high = manifold.lower[self._in_x], manifold.upper[self._in_x]
         self._state = self._begin(np.zeros((0, manifold.chart.nx)), np.zeros(0, dtype=int))
 
     @property
@@ -100,9 +92,8 @@ class BatchDescent:
 
         Return the number of descents that began.
         """
-        x, residual, _ = self._returned(x, _PROJECTING)
-        on = residual <= _SATISFIED
-        begun = self._begin(x[on], tag[on])
+        projected = self.manifold.project(x, _PROJECTING, within=True, tolerance=_SATISFIED)
+        begun = self._begin(projected.x[projected.converged], tag[projected.converged])
         begun = begun.taken(np.isfinite(begun.merit))
         self._state = self._state.joined(begun)
         return len(begun.x)
@@ -114,14 +105,14 @@ class BatchDescent:
         size = np.linalg.norm(s.direction, axis=1)
         length = np.minimum(s.length, _LONGEST / np.maximum(size, 1e-300))
         moved = length[:, None] * s.direction
-        x, residual, jacobian = self._returned(manifold.move(s.x, moved), _RETURNING)
-        merit, gradient = manifold.merit(x)
+        to = manifold.project(manifold.move(s.x, moved), _RETURNING, within=True, tolerance=_SATISFIED)
+        merit, gradient = manifold.merit(to.x)
         bound = s.merit + _SUFFICIENT * length * (s.direction * s.gradient).sum(axis=1)
-        accepted = np.isfinite(merit) & (residual <= _DRIFT) & (merit <= bound)
+        accepted = np.isfinite(merit) & (to.residual <= _DRIFT) & (merit <= bound)
         s.length = np.where(accepted, 1.0, length * _SHORTER)
         stuck = ~accepted & (length * size < _SHORTEST)
         if accepted.any():
-            self._accept(accepted, x, merit, gradient, jacobian, moved)
+            self._accept(accepted, to.x, merit, gradient, to.jacobian, moved)
         decrease = -(s.direction * s.gradient).sum(axis=1)
         ended = (decrease < _CONVERGED) | stuck | (s.age >= _STEPS)
         self._state = s.taken(~ended)
@@ -129,20 +120,20 @@ class BatchDescent:
 
     def _begin(self, x: Array, tag: NDArray[np.int_]) -> _State:
         merit, gradient = self.manifold.merit(x)
-        along = _Along(self, x, self.manifold.equalities(x)[1], gradient).gradient
+        along = _Along(self.manifold, x, self.manifold.equalities(x)[1], gradient).gradient
         count, nv = gradient.shape
         hessian = np.broadcast_to(np.eye(nv), (count, nv, nv)).copy()
         ones = np.ones(count)
-        return _State(x, merit, along, -along, hessian, ones > 0, ones, np.zeros(count, dtype=int), tag)
+        return _State(x, merit, tag, along, -along, hessian, ones > 0, ones, np.zeros(count, dtype=int))
 
     def _accept(
         self, rows: NDArray[np.bool_], x: Array, merit: Array, gradient: Array, jacobian: Array, moved: Array
     ) -> None:
         """Move the descents of a mask to their new postures, and choose their next directions."""
         s, identity = self._state, np.eye(self.manifold.chart.nv)
-        along = _Along(self, x[rows], jacobian[rows], gradient[rows])
+        along = _Along(self.manifold, x[rows], jacobian[rows], gradient[rows])
         hessian, fresh = _updated(s.hessian[rows], s.fresh[rows], moved[rows], along.gradient - s.gradient[rows])
-        direction = along.project(-_times(hessian, along.gradient))
+        direction = along.project(-times(hessian, along.gradient))
         slope = (direction * along.gradient).sum(axis=1)
         sizes = np.linalg.norm(direction, axis=1) * np.linalg.norm(along.gradient, axis=1)
         uphill = slope > -_DOWNHILL * sizes
@@ -151,58 +142,28 @@ class BatchDescent:
         s.x[rows], s.merit[rows], s.gradient[rows] = x[rows], merit[rows], along.gradient
         s.hessian[rows], s.fresh[rows], s.direction[rows] = hessian, fresh, direction
 
-    def _returned(self, x: Array, steps: int) -> tuple[Array, Array, Array]:
-        """Return postures after Gauss–Newton steps within the limits, with the residuals and the Jacobians there."""
-        manifold = self.manifold
-        x = np.clip(x, manifold.lower, manifold.upper)
-        value, jacobian = manifold.equalities(x)
-        residual = np.abs(value).max(axis=1, initial=0.0)
-        for _ in range(steps):
-            left = np.flatnonzero(residual > _SATISFIED)
-            if not left.size:
-                break
-            step = -_times(right_inverse(jacobian[left]), value[left])
-            at_limit = self.blocked(x[left], step)
-            again = np.flatnonzero(at_limit.any(axis=1))
-            if again.size:
-                free = np.where(at_limit[again, None, :], 0.0, jacobian[left[again]])
-                step[again] = -_times(right_inverse(free), value[left[again]])
-            size = np.linalg.norm(step, axis=1, keepdims=True)
-            step *= np.minimum(1.0, _LONGEST_RETURN / np.maximum(size, 1e-300))
-            x[left] = np.clip(manifold.move(x[left], step), manifold.lower, manifold.upper)
-            value[left], jacobian[left] = manifold.equalities(x[left])
-            residual[left] = np.abs(value[left]).max(axis=1, initial=0.0)
-        return x, residual, jacobian
-
-    def blocked(self, x: Array, direction: Array) -> NDArray[np.bool_]:
-        """Return a mask, shape (N, nv), of the joints at a limit that the direction would violate."""
-        at, along = x[:, self._in_x], direction[:, self._in_v]
-        blocked = np.zeros(direction.shape, dtype=bool)
-        blocked[:, self._in_v] = ((at <= self._low + 1e-9) & (along < 0)) | ((at >= self._high - 1e-9) & (along > 0))
-        return blocked
-
 
 class _Along:
     """Tangent vectors along the equalities and the active joint limits; ``gradient`` is the projected gradient."""
 
-    def __init__(self, descent: BatchDescent, x: Array, jacobian: Array, gradient: Array) -> None:
+    def __init__(self, manifold: ConstraintManifold, x: Array, jacobian: Array, gradient: Array) -> None:
         free = np.ones(gradient.shape, dtype=bool)
         for _ in range(_ACTIVE_SETS):
             self._free = free
             self._jacobian = np.where(self._free[:, None, :], jacobian, 0.0)
             self._inverse = right_inverse(self._jacobian)
             # The gradient minus the forces of the equalities: at a limit, its sign says whether the limit is active.
-            multipliers = _times(self._inverse.transpose(0, 2, 1), gradient)
-            rest = gradient - _times(jacobian.transpose(0, 2, 1), multipliers)
+            multipliers = times(self._inverse.transpose(0, 2, 1), gradient)
+            rest = gradient - times(jacobian.transpose(0, 2, 1), multipliers)
             self.gradient = np.where(self._free, rest, 0.0)
-            free = ~descent.blocked(x, -rest)
+            free = ~manifold.blocked(x, -rest)
             if (free == self._free).all():
                 break
 
     def project(self, v: Array) -> Array:
         """Return the parts of tangent vectors, shape (N, nv), along the equalities and limits."""
         v = np.where(self._free, v, 0.0)
-        return np.asarray(v - _times(self._inverse, _times(self._jacobian, v)))
+        return np.asarray(v - times(self._inverse, times(self._jacobian, v)))
 
 
 def _updated(hessian: Array, fresh: NDArray[np.bool_], step: Array, change: Array) -> tuple[Array, NDArray[np.bool_]]:
@@ -212,11 +173,7 @@ def _updated(hessian: Array, fresh: NDArray[np.bool_], step: Array, change: Arra
     first = usable & fresh
     hessian[first] = (curvature[first] / squared[first])[:, None, None] * np.eye(step.shape[1])
     share = np.where(usable, 1 / np.where(usable, curvature, 1.0), 0.0)
-    turned = _times(hessian, change)
+    turned = times(hessian, change)
     half = share * (1 + share * (change * turned).sum(axis=1)) / 2
     outer = (half[:, None] * step - share[:, None] * turned)[:, :, None] * step[:, None, :]
     return hessian + outer + outer.transpose(0, 2, 1), fresh & ~usable
-
-
-def _times(matrices: Array, vectors: Array) -> Array:
-    return np.asarray((matrices @ vectors[:, :, None])[:, :, 0])

@@ -32,9 +32,18 @@ _PENALTY = 200.0
 
 @dataclass(frozen=True)
 class Projected:
-    """Projected postures in chart coordinates, shape (N, nx), and whether each satisfies the equalities."""
+    """Projected postures in chart coordinates.
+
+    Attributes:
+        x: Postures, shape (N, nx).
+        residual: Largest violation of an equality, shape (N,).
+        jacobian: Tangent Jacobian of the equalities, shape (N, m, nv).
+        converged: Whether each posture satisfies the equalities, shape (N,).
+    """
 
     x: Array
+    residual: Array
+    jacobian: Array
     converged: NDArray[np.bool_]
 
 
@@ -139,24 +148,41 @@ class ConstraintManifold:
         turns = np.where(self._turning, np.floor((moved - self._middle + np.pi) / (2 * np.pi)), 0.0)
         return np.asarray(moved - 2 * np.pi * turns)
 
-    def project(self, x: Array, steps: int = 20, *, within: bool = False) -> Projected:
+    def project(self, x: Array, steps: int = 20, *, within: bool = False, tolerance: float = _CONVERGED) -> Projected:
         """Project postures, shape (N, nx), onto the equalities by Gauss–Newton steps of least norm.
 
-        With ``within``, the postures also stay within the joint limits.
+        With ``within``, the postures also stay within the joint limits, along which they slide.  ``tolerance`` is the
+        largest violation of an equality, m or rad, at which a projection ends.
         """
-        x, left = x.copy(), np.arange(len(x))
-        converged = np.zeros(len(x), dtype=bool)
-        for step in range(steps + 1):
+        x = np.clip(x, self.lower, self.upper) if within else x.copy()
+        value, jacobian = self.equalities(x)
+        residual = np.abs(value).max(axis=1, initial=0.0)
+        for _ in range(steps):
+            left = np.flatnonzero(residual > tolerance)
+            if not left.size:
+                break
+            step = -times(right_inverse(jacobian[left]), value[left])
+            at_limit = self.blocked(x[left], step) if within else np.zeros(step.shape, dtype=bool)
+            again = np.flatnonzero(at_limit.any(axis=1))
+            if again.size:
+                free = np.where(at_limit[again, None, :], 0.0, jacobian[left[again]])
+                step[again] = -times(right_inverse(free), value[left[again]])
+            size = np.linalg.norm(step, axis=1, keepdims=True)
+            x[left] = self.move(x[left], step * np.minimum(1.0, _LONGEST_STEP / np.maximum(size, 1e-300)))
             if within:
                 x[left] = np.clip(x[left], self.lower, self.upper)
-            value, jacobian = self.equalities(x[left])
-            done = np.abs(value).max(axis=1, initial=0.0) < _CONVERGED
-            converged[left[done]] = True
-            left, value, jacobian = left[~done], value[~done], jacobian[~done]
-            if not left.size or step == steps:
-                break
-            x[left] = self.move(x[left], -_least_norm(jacobian, value))
-        return Projected(x, converged)
+            value[left], jacobian[left] = self.equalities(x[left])
+            residual[left] = np.abs(value[left]).max(axis=1, initial=0.0)
+        return Projected(x, residual, jacobian, residual <= tolerance)
+
+    def blocked(self, x: Array, direction: Array) -> NDArray[np.bool_]:
+        """Return a mask, shape (N, nv), of the joints at a limit that the direction would violate."""
+        in_v, in_x = (np.array(places, dtype=int) for places in self.chart.bounded)
+        at, along = x[:, in_x], direction[:, in_v]
+        blocked = np.zeros(direction.shape, dtype=bool)
+        at_low, at_high = at <= self.lower[in_x] + 1e-9, at >= self.upper[in_x] - 1e-9
+        blocked[:, in_v] = (at_low & (along < 0)) | (at_high & (along > 0))
+        return blocked
 
     def embed(self, x: Array) -> Array:
         """Return points, shape (N, k); their Euclidean distances equal the distances of postures that are close."""
@@ -186,11 +212,9 @@ def right_inverse(jacobian: Array) -> Array:
     return np.asarray(jacobian.transpose(0, 2, 1) @ np.linalg.inv(gram))
 
 
-def _least_norm(jacobian: Array, value: Array) -> Array:
-    """Return the steps of least norm with ``J v = c``, shortened to the longest step, shape (N, nv)."""
-    step = (right_inverse(jacobian) @ value[:, :, None])[:, :, 0]
-    length = np.linalg.norm(step, axis=1, keepdims=True)
-    return np.asarray(step * np.minimum(1.0, _LONGEST_STEP / np.maximum(length, 1e-300)))
+def times(matrices: Array, vectors: Array) -> Array:
+    """Return the product of each matrix, shape (N, k, m), and vector, shape (N, m); the result has shape (N, k)."""
+    return np.asarray((matrices @ vectors[:, :, None])[:, :, 0])
 
 
 def _tangent_map(slots: Sequence[JointSlot], q: ca.SX, nx: int) -> ca.SX:
