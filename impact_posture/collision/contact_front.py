@@ -84,7 +84,14 @@ class _Silhouettes:
 
 
 def contact_front(
-    robot: Robot, q: Array, frame: str, offset: Vector3, direction: Array, held: Sequence[str] = ()
+    robot: Robot,
+    q: Array,
+    frame: str,
+    offset: Vector3,
+    direction: Array,
+    held: Sequence[str] = (),
+    *,
+    in_world: bool = False,
 ) -> ContactFront | None:
     """Return the front of the links that do not move relative to a contact frame; ``None`` without shapes.
 
@@ -93,11 +100,12 @@ def contact_front(
 
     Args:
         robot: The robot with its shapes.
-        q: Posture, shape (nq,); only the positions of the joints ``held`` have an effect.
+        q: Posture, shape (nq,).
         frame: Contact frame.
         offset: Contact point in the coordinates of the frame, shape (3,), m.
-        direction: Direction towards the surface, ``−n``, in the coordinates of the frame, shape (3,).
+        direction: Direction towards the surface, ``−n``, shape (3,).
         held: Joints that do not move.
+        in_world: Whether the direction is in world axes instead of the axes of the frame.
     """
     carrier = robot.model.frames[robot.frame_id(frame)]
     shapes = _shapes_near(robot, int(carrier.parentJoint), tuple(held))
@@ -106,7 +114,7 @@ def contact_front(
     data = robot.model.createData()
     pin.forwardKinematics(robot.model, data, q)
     to_frame = (data.oMi[carrier.parentJoint] * carrier.placement).inverse()
-    d = np.asarray(direction, dtype=float) / np.linalg.norm(direction)
+    d = (to_frame.rotation if in_world else np.eye(3)) @ direction / np.linalg.norm(direction)
     points, owners = [], list[str]()
     for shape in shapes:
         at = to_frame * data.oMi[shape.joint]

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import pinocchio as pin
 
 from impact_posture.collision.contact_front import ContactFront, contact_front
 from impact_posture.errors import ContactError
@@ -42,13 +41,8 @@ def front_of(robot: Robot, contact: ImpactContact, q: Array, held: Sequence[str]
 
     ``q`` is the posture, shape (nq,).  Return ``None`` if these links have no shapes.
     """
-    direction = -np.array(contact.normal)
-    if contact.normal_frame == "world":
-        data = robot.model.createData()
-        pin.forwardKinematics(robot.model, data, q)
-        placement = pin.updateFramePlacement(robot.model, data, robot.frame_id(contact.frame))
-        direction = placement.rotation.T @ direction
-    return contact_front(robot, q, contact.frame, contact.offset, direction, held)
+    in_world = contact.normal_frame == "world"
+    return contact_front(robot, q, contact.frame, contact.offset, -np.array(contact.normal), held, in_world=in_world)
 
 
 def at_front(robot: Robot, contact: ImpactContact, q: Array, held: Sequence[str] = ()) -> ImpactContact:
@@ -62,11 +56,3 @@ def at_front(robot: Robot, contact: ImpactContact, q: Array, held: Sequence[str]
         what = f"the links at {contact.frame} have no shapes, so their front is unknown"
         raise ContactError(what, where="contact_point", hint="give the contact point as `offset` X Y Z")
     return replace(contact, offset=front.offset)
-
-
-def early_touches(
-    robot: Robot, contacts: Sequence[ImpactContact], q: Array, held: Sequence[str] = ()
-) -> tuple[EarlyTouch, ...]:
-    """Return the links that reach more than :data:`BEYOND` beyond a contact point at ``q``, shape (nq,)."""
-    touches = [(contact, front_of(robot, contact, q, held)) for contact in contacts]
-    return tuple(EarlyTouch(c, front) for c, front in touches if front is not None and front.reach > BEYOND)
