@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -18,7 +17,7 @@ from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import Located, build_robot, known_robots, load_robot, locate
 from impact_posture.robot.robot_spec import SCHEMA, ModelSpec, RobotSpec, Support
 from impact_posture.robot.toml_lines import Draft, comment_lines
-from impact_posture.robot.urdf import EXAMPLE_PREFIX, example_robot_data, resolve_path
+from impact_posture.robot.urdf import EXAMPLE_PREFIX, example_robot_data, parse_urdf, resolve_path
 from impact_posture.system.escape import toml
 from impact_posture.system.output_folder import check_name
 
@@ -193,7 +192,7 @@ def _supports(draft: Draft, robot: Robot, feet: Sequence[Support]) -> None:
 
 
 def _constraints(draft: Draft, robot: Robot, feet: Sequence[Support], carrying: Sequence[str], urdf: Path) -> None:
-    mimics = {j.get("name") for j in ET.parse(urdf).getroot().iter("joint") if j.find("mimic") is not None}
+    mimics = {j.get("name") for j in parse_urdf(urdf).iter("joint") if j.find("mimic") is not None}
     free = [joint for joint in robot.joint_names if joint not in carrying]
     hold = [joint for joint in free if joint in mimics or joint in guess.fingers(robot)]
     keys = Draft()

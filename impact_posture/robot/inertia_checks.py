@@ -124,13 +124,17 @@ def _link_fault(link: ET.Element, where: str) -> tuple[float, str] | None:
     mass_tag, inertia_tag = inertial.find("mass"), inertial.find("inertia")
     if mass_tag is None:
         raise InertiaError(f"link '{name}' has an <inertial> without <mass>", where=where, hint="add its mass")
-    mass = _number(mass_tag, "value", name, where)
+    (mass,) = _numbers(mass_tag, "value", name, where)
+    # urdfdom drops the whole <inertial> if its origin or a moment cannot be read.
+    if (origin := inertial.find("origin")) is not None:
+        for key in sorted({"xyz", "rpy"}.intersection(origin.keys())):
+            _numbers(origin, key, name, where, 3)
     if mass < 0:
         raise InertiaError(f"link '{name}' has the mass {mass:g} kg", where=where, hint="give a positive mass")
     if inertia_tag is None:
         return None
     xx, xy, xz, yy, yz, zz = (
-        _number(inertia_tag, key, name, where) for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+        _numbers(inertia_tag, key, name, where)[0] for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
     )
     moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     largest = float(np.abs(moments).max())
@@ -147,12 +151,13 @@ def _link_fault(link: ET.Element, where: str) -> tuple[float, str] | None:
     return None
 
 
-def _number(tag: ET.Element, key: str, link: str, where: str) -> float:
-    text = tag.get(key, "0")
+def _numbers(tag: ET.Element, key: str, link: str, where: str, count: int = 1) -> list[float]:
+    text = tag.get(key, "")
     try:
-        value = float(text)
+        values = [float(word) for word in text.split()]
     except ValueError:
-        value = float("nan")
-    if not np.isfinite(value):
-        raise InertiaError(f"link '{link}': {tag.tag} {key}='{text}' is not a number", where=where, hint="correct it")
-    return value
+        values = []
+    if len(values) != count or not np.isfinite(values).all():
+        fault = f"link '{link}': {tag.tag} {key}='{text}' is not {'a number' if count == 1 else f'{count} numbers'}"
+        raise InertiaError(fault, where=where, hint="correct it")
+    return values

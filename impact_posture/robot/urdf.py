@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import codecs
 import contextlib
 import os
+import re
 import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
+from xml.parsers import expat
 
 import pinocchio as pin
 
@@ -20,6 +23,10 @@ from impact_posture.robot.inertia_checks import check_inertias
 MOST_DEGREES_OF_FREEDOM = 200
 # Largest number of joints in a chain, including fixed joints.  Above 2,000, the URDF parser overflows the stack.
 _DEEPEST = 1_000
+# A comment.  It may contain "--", which XML forbids and urdfdom accepts.
+_COMMENT = re.compile("<!--.*?-->", re.DOTALL)
+# An ampersand that begins no entity, which XML forbids and urdfdom accepts.
+_LONE_AMPERSAND = re.compile(r"&(?!(?:amp|lt|gt|quot|apos|#\d+|#x[\da-fA-F]+);)")
 
 EXAMPLE_PREFIX = "example-robot-data:"
 
@@ -89,7 +96,8 @@ def build_model(
     _check_depth(root, path)
     try:
         with quiet_stderr() as errors:
-            model = pin.buildModelFromUrdf(str(path), *([pin.JointModelFreeFlyer()] if free_flyer else []))
+            # The decoded text instead of the file, because urdfdom reads each file as UTF-8.
+            model = pin.buildModelFromXML(_xml_text(path), *([pin.JointModelFreeFlyer()] if free_flyer else []))
     except Exception as error:  # The type of exception differs between versions of Pinocchio.
         fault = f"makes no robot ({errors[0] or error})"
         raise UrdfError(fault, where=str(path), hint="correct the URDF") from None
@@ -140,21 +148,62 @@ def _mimics(root: ET.Element) -> tuple[dict[str, str], list[str]]:
 
 
 def parse_urdf(path: Path) -> ET.Element:
-    """Return the root element of a URDF; raise ``UrdfError`` if the file is missing or is not a URDF."""
+    """Return the root element of a URDF; accept all that urdfdom accepts (names with ``:``, any encoding, ``--``).
+
+    Raises:
+        UrdfError: The file is missing, is not a URDF, or contains expressions or elements of xacro.
+    """
     if os.path.isdir(path):
         raise UrdfError("is a folder", where=str(path), hint="name the .urdf file in it")
     try:
-        root = ET.parse(path).getroot()
+        root = _parse_xml(_xml_text(path))
     except OSError as error:
         raise UrdfError.unreadable(path, error) from None
-    except (ET.ParseError, ValueError) as error:  # Path raises ValueError for a name with a null character.
+    except (expat.ExpatError, ValueError) as error:  # Path raises ValueError for a name with a null character.
         raise UrdfError(f"is not XML ({error})", where=str(path), hint="give a URDF file") from None
     if root.tag != "robot":
         fault = f"is XML but not a URDF: its root is <{root.tag}>, not <robot>"
         raise UrdfError(fault, where=str(path), hint="expand xacro first, or give the .urdf")
     if root.find("link") is None:
         raise UrdfError("has no <link>", where=str(path), hint="expand xacro first, or give the .urdf")
+    if leftover := _xacro_leftover(root):
+        fault = f"contains {leftover}, which only xacro can evaluate"
+        raise UrdfError(fault, where=str(path), hint="expand it: xacro FILE > FILE.urdf")
     return root
+
+
+def _parse_xml(text: str) -> ET.Element:
+    """Parse XML without namespaces, which have no meaning in a URDF."""
+    builder, parser = ET.TreeBuilder(), expat.ParserCreate()
+    parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end
+    parser.CharacterDataHandler = builder.data
+    parser.Parse(text, True)
+    return builder.close()
+
+
+def _xml_text(path: Path) -> str:
+    """Return a file as text without comments; most files are in UTF-8, whatever encoding they declare."""
+    data = Path(path).read_bytes()
+    declared = re.match(rb"""\s*<\?xml[^>]*?encoding=["']([\w.:-]+)""", data)
+    utf_16 = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    for encoding in ("utf-16" if utf_16 else "utf-8-sig", declared[1].decode() if declared else "", "latin-1"):
+        with contextlib.suppress(UnicodeDecodeError, LookupError):
+            text = data.decode(encoding)
+            break
+    text = _COMMENT.sub(lambda comment: "\n" * comment[0].count("\n"), text)
+    return _LONE_AMPERSAND.sub("&amp;", text).strip()
+
+
+def _xacro_leftover(root: ET.Element) -> str:
+    """Return the first xacro element, or the first xacro expression in a link or joint; empty if there is none."""
+    for element in root:
+        if element.tag.startswith("xacro:"):
+            return f"<{element.tag}>"
+        for part in element.iter() if element.tag in ("link", "joint") else ():
+            for key, value in part.items():
+                if ("${" in value or "$(" in value) and part.tag != "mesh":
+                    return f"'{value}' in <{part.tag} {key}>"
+    return ""
 
 
 @contextlib.contextmanager

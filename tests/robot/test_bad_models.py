@@ -8,8 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from impact_posture.collision.robot_shapes import shape_warnings
 from impact_posture.config.problem_settings import LoadOptions
 from impact_posture.errors import ImpactPostureError, InertiaError, SpecError, UrdfError
+from impact_posture.robot.draft import write_draft
 from impact_posture.robot.robot_loader import load_robot
 
 GOOD = '<mass value="1"/><inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/>'
@@ -98,6 +100,56 @@ def test_files_that_are_no_robot(
     one_line(caught.value, *words)
     # Messages of the parser must not appear on the terminal.
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('value="1"', 'value="${m}"', ("'${m}' in <mass value>", "xacro FILE")),
+        ('upper="1"', 'upper="$(arg reach)"', ("'$(arg reach)' in <limit upper>", "xacro FILE")),
+        ("<robot name='bad'>", "<robot name='bad'><xacro:arm side='left'/>", ("<xacro:arm>", "xacro FILE")),
+        ('value="1"', 'value="1,5"', ("link 'a': mass value='1,5' is not a number", "correct it")),
+        ('ixx="0.01"', "", ("link 'a': inertia ixx='' is not a number", "correct it")),
+        ('xyz="0.1 0.2 0.3"', 'xyz="0.1 0.2"', ("link 'b': origin xyz='0.1 0.2' is not 3 numbers", "correct it")),
+        ('upper="1"', 'upper="1,5"', ("upper value (1,5) is not a valid float", "correct the URDF")),
+    ],
+)
+def test_values_that_cannot_be_read(load: Load, old: str, new: str, words: tuple[str, ...]) -> None:
+    """Pinocchio drops an <inertial> that it cannot read, without an error."""
+    text = f"<robot name='bad'>{link('a', GOOD)}{link('b', OFF_AXIS)}{joint('a', 'b')}</robot>"
+    load(text=text)
+    with pytest.raises(UrdfError) as caught:
+        load(text=text.replace(old, new, 1))
+    one_line(caught.value, *words)
+
+
+_NAMED = f"{link('a', GOOD)}{link('Unterarm_ä', OFF_AXIS)}{joint('a', 'Unterarm_ä')}"
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        f"<robot name='r'>{_NAMED}</robot>".encode("latin-1"),
+        f'<?xml version="1.0" encoding="utf-8"?><robot name="r">{_NAMED}</robot>'.encode("latin-1"),
+        f'<?xml version="1.0" encoding="iso-8859-1"?><robot name="r">{_NAMED}</robot>'.encode(),
+        f'<?xml version="1.0" encoding="cp850"?><robot name="r">{_NAMED}</robot>'.encode("cp850"),
+        f'\n <?xml version="1.0" encoding="no-codec"?><robot name="r">{_NAMED}</robot>'.encode("utf-8-sig"),
+        f'<?xml version="1.0" encoding="utf-16"?><robot name="r">{_NAMED}</robot>'.encode("utf-16"),
+        f"<robot xmlns='http://www.ros.org' name='r'>{_NAMED}</robot>".encode(),
+        f"<robot name='r'><gazebo><sensor:camera name='eye'/></gazebo>{_NAMED}</robot>".encode(),
+        f"<robot name='r & d'><!-- --- <arm> --- -->{_NAMED}</robot>".encode(),
+        f"<robot name='r'><gazebo><file>$(find robot)/${{a}}</file></gazebo>{_NAMED}</robot>".encode(),
+    ],
+    ids=["latin1", "wrong-utf8", "wrong-latin1", "cp850", "bom", "utf16", "xmlns", "prefix", "comment", "gazebo"],
+)
+def test_files_that_urdfdom_reads(tmp_path: Path, data: bytes) -> None:
+    path = tmp_path / "robot.urdf"
+    path.write_bytes(data)
+    robot = load_robot(str(path))
+    assert robot.joint_names == ("a_Unterarm_ä",)
+    assert "Unterarm_ä" in robot.frame_names
+    assert shape_warnings(robot)[0].startswith("the robot has no shapes")
+    assert 'frame = "Unterarm_ä"' in write_draft(str(path), LoadOptions(), None)[1].text
 
 
 def test_a_mimic_of_a_joint_that_does_not_exist_is_a_warning(load: Load) -> None:
