@@ -8,7 +8,7 @@ from __future__ import annotations
 import difflib
 import reprlib
 import unicodedata
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import ClassVar, Self
 
@@ -54,6 +54,11 @@ def nearest(name: str, known: Iterable[str], count: int = 5) -> list[str]:
 def one_line(text: str) -> str:
     """Return a message as one line of limited length, without characters that control a terminal."""
     return printable(" ".join(text.split()), longest=_LONGEST_PART)
+
+
+def listed(names: Sequence[str], most: int = 5) -> str:
+    """Return the first names, and how many more there are."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def shown(value: object) -> str:
@@ -274,9 +279,7 @@ class Infeasible(ImpactPostureError):
     def __init__(self, conflicts: dict[str, float], *, where: str = "problem", hint: str = "") -> None:
         self.conflicts = dict(conflicts)
         worst = sorted(self.conflicts.items(), key=lambda conflict: -conflict[1])
-        named = ", ".join(f"{name} (off by {value:.3g})" for name, value in worst[:_MOST_NAMED])
-        if len(worst) > _MOST_NAMED:
-            named += f" and {len(worst) - _MOST_NAMED} more"
+        named = listed([f"{name} (off by {value:.3g})" for name, value in worst], _MOST_NAMED)
         super().__init__(
             f"the constraints conflict: {named}",
             where=where,

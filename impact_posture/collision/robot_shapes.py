@@ -17,13 +17,11 @@ from impact_posture.collision.shape_pairs import Pair, mostly_touching, nested_p
 from impact_posture.collision.swept_hull import Fit, SweptHull, fit_hull
 from impact_posture.collision.urdf_shapes import UrdfShape, read_urdf_shapes
 from impact_posture.config.cached_values import StoredArray, read_stored, write_stored
-from impact_posture.errors import one_line
+from impact_posture.errors import listed, one_line
 from impact_posture.robot.robot import Robot
 from impact_posture.system.progress import tell
 
 NO_SHAPES = "the robot has no shapes, so nothing keeps its links apart; joint origins are checked at the end"
-# Largest number of links that a warning names.
-_MOST_NAMED = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,8 +102,7 @@ class _Source:
         """Return all warnings if the shapes of the links ``used`` are used and loading them gave ``warnings``."""
         words, bare = [] if used else [NO_SHAPES], self.without_shapes(used)
         if used and bare:
-            more = f" and {len(bare) - _MOST_NAMED} more" if len(bare) > _MOST_NAMED else ""
-            named = f"links without shapes: {', '.join(bare[:_MOST_NAMED])}{more}"
+            named = f"links without shapes: {listed(bare)}"
             words = [one_line(f"{named}; nothing keeps them from a collision, and only their origins are checked")]
         return (*self.warnings, *warnings, *words)
 

@@ -18,6 +18,7 @@ import pinocchio as pin
 
 from impact_posture.errors import PackageNotFound, SpecError, UrdfError, nearest
 from impact_posture.robot.inertia_checks import check_inertias
+from impact_posture.robot.urdf_joints import correct_joints
 
 # pin.Data always contains 6 nv³ numbers: 0.4 GB at 200 degrees of freedom, and 48 GB at 1,000.
 MOST_DEGREES_OF_FREEDOM = 200
@@ -112,7 +113,8 @@ def build_model(
         fault = f"has {model.nv} degrees of freedom, more than the supported {MOST_DEGREES_OF_FREEDOM}"
         raise UrdfError(fault, where=str(path), hint="in the URDF, fix the joints that hardly matter")
     mimics, lost = _mimics(root)
-    return model, (*check_inertias(root, model, path, accept_inertias), *lost), mimics
+    warnings = (*check_inertias(root, model, path, accept_inertias), *correct_joints(root, model, path), *lost)
+    return model, warnings, mimics
 
 
 def _check_depth(root: ET.Element, path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from impact_posture.dynamics.numeric import Numeric
+from impact_posture.errors import listed
 from impact_posture.impact.impact_contact import point_on
 from impact_posture.posture.formulation.problem_file import Prepared
 from impact_posture.posture.loads.holding_forces import HoldingForces
@@ -41,13 +42,13 @@ def _surface_warnings(prepared: Prepared, initial: Array, q: Array, posture: str
     lines = []
     if before:
         lines.append(
-            f"the initial posture has {_named(before)} behind the surface: the normal points out of it, "
+            f"the initial posture has {listed(before, 3)} behind the surface: the normal points out of it, "
             "towards the robot; check its sign"
         )
     new = [name for name in after if name not in before]
     if new:
         lines.append(
-            f"the {posture} posture brings {_named(new)} behind the plane of the surface: no constraint prevents "
+            f"the {posture} posture brings {listed(new, 3)} behind the plane of the surface: no constraint prevents "
             "this; bound the base or the joints if the surface reaches that far"
         )
     return lines
@@ -75,7 +76,7 @@ def _ground_warnings(prepared: Prepared, q: Array, posture: str) -> list[str]:
     ground = min(numeric.placement(point_on(robot, s.frame, s.offset)).translation[2] for s in supports)
     below = [name for _, name, origin in _origins(prepared, numeric) if origin[2] < ground - _BEHIND]
     text = (
-        f"the {posture} posture has {_named(below)} below the lowest foot: no constraint keeps them above the "
+        f"the {posture} posture has {listed(below, 3)} below the lowest foot: no constraint keeps them above the "
         "ground; narrow their limits (robot.toml [limits.position]) or stay nearer with `regularization`"
     )
     return [text] if below else []
@@ -94,7 +95,3 @@ def _origins(prepared: Prepared, numeric: Numeric) -> list[tuple[int, str, Array
         return [(k, f"link {f.name}", (numeric.data.oMi[k] * f.placement).translation) for k, f in placed if k > 0]
     names = ["the base" if name == "root_joint" else str(name) for name in robot.model.names]
     return [(k, names[k], numeric.data.oMi[k].translation) for k in range(1, robot.model.njoints)]
-
-
-def _named(names: list[str]) -> str:
-    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")

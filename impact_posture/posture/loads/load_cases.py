@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pinocchio as pin
 
+from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.tree import PointOnLink
-from impact_posture.errors import InputError
+from impact_posture.errors import InputError, listed
 from impact_posture.impact.impact_contact import ImpactContact, point_on
 from impact_posture.impact.objective import Objective
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
@@ -19,6 +20,7 @@ from impact_posture.posture.loads.holdable import Holdable, ReachableWrench
 from impact_posture.posture.loads.holding_forces import HoldingForces
 from impact_posture.posture.loads.static_load import ForceSource, StaticLoad
 from impact_posture.robot.actuation import allocation_matrix, thrust_limits, torque_limits
+from impact_posture.robot.model_joints import finite_armature
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 
@@ -105,6 +107,7 @@ def load_cases(objective: Objective, q: Array, requirements: Requirements) -> Lo
         return LoadCases((), (f"whether the robot can hold the posture is not checked: {unknown}",), unknown)
     free = [s.frame for s in objective.supports if feet and s.kind == "surface" and not s.has_sole]
     notes = [f"the moments that {', '.join(free)} can support are not checked: the sole has no size"] if free else []
+    notes += _unlimited(robot)
     kinds = ["joint torques", *["rotor thrusts"] * bool(rotors), *["forces of the feet"] * bool(feet)]
     what = " and ".join([", ".join(kinds[:-1]), kinds[-1]] if kinds[1:] else kinds)
     sources, balance, thrusts = [*rotors, *feet], reach[:rank], Thrusts()
@@ -123,6 +126,20 @@ def load_cases(objective: Objective, q: Array, requirements: Requirements) -> Lo
             name = (f"while it pushes with {pushed:g} N" if pushed else "at rest") + variant
             cases.append(LoadCase(name, f"{what} within {within} {name}", rest, reach[rank:]))
     return LoadCases(tuple(cases), tuple(notes))
+
+
+def _unlimited(robot: Robot) -> list[str]:
+    """Return notes that name the joints whose torque is not checked, because no effort limit is known."""
+    unlimited = np.isinf(torque_limits(robot.model)) & ~finite_armature(robot.model)[1]
+    slots = [
+        slot for slot in Chart.of(robot.model).slots if slot.name in robot.joint_names and unlimited[slot.v].any()
+    ]
+    driven = [slot.name for slot in slots if slot.kind.family in ("revolute", "continuous", "prismatic")]
+    passive = [slot.name for slot in slots if slot.name not in driven]
+    limit = "an effort limit (0, or not stated); state it in robot.toml [limits.effort]"
+    torque = f"at rest, the torque of {listed(driven)} is not checked without {limit}"
+    balance = f"at rest, the balance of {listed(passive)} is not checked, because nothing drives it"
+    return [torque] * bool(driven) + [balance] * bool(passive)
 
 
 def _reach(load: StaticLoad, q: Array) -> tuple[Array, int]:

@@ -1,0 +1,40 @@
+"""Robots with passive, free, held and sliding joints: what is checked, what is noted, and what is no constraint."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from impact_posture.config.problem_settings import ProblemSettings
+from impact_posture.config.table_validation import validate
+from impact_posture.posture.formulation.problem_file import prepare
+from impact_posture.posture.program.constrained_problem import ConstrainedProblem
+from tests.support.urdfs import joint, link, write
+
+LINKS = (link("stand", 5), link("upper", 2, "0.2 0 0"), link("fore", 1.5, "0.2 0 0"), link("palm", 0.5, "0.05 0 0"))
+TIP = (link("tip"), joint("tip_mount", "palm tip", None, "0.1 0 0", "fixed", ""))
+BENT = "[postures.bent]\njoints = { a = -0.9, b = 1.2, c = 0.5 }\n"
+
+
+def posed(folder: Path, *elements: str, toml: str = BENT, **settings: object) -> ConstrainedProblem:
+    path = write(folder, *elements, toml=toml)
+    values = {"robot": str(path), "frame": "tip", "normal": (0.0, 0.0, 1.0), "contact_pose": "position"}
+    return prepare(validate(ProblemSettings, {**values, **settings}, "options")).problem
+
+
+def test_joints_whose_torque_is_not_checked_are_named(tmp_path: Path) -> None:
+    """Effort 0 means that no limit is stated; a floating joint has no actuator."""
+    arm = (*LINKS, *TIP, joint("a", "stand upper", at="0 0 0.3"), joint("c", "fore palm", at="0.4 0 0"))
+    elbow = joint("b", "upper fore", at="0.4 0 0")
+    torque, balance = "the torque of b is not checked", "the balance of load is not checked"
+    load = link("crate", 1), joint("load", "upper crate", None, kind="floating", more="")
+    assert not [note for note in posed(tmp_path, *arm, elbow).notes if "not checked" in note]
+    for parts, expected in (
+        ((elbow.replace('effort="100"', 'effort="0"'),), (torque,)),
+        ((elbow, *load), (balance,)),
+        ((elbow.replace('effort="100"', 'effort="0"'), *load), (torque, balance)),
+    ):
+        problem = posed(tmp_path, *arm, *parts)
+        notes = [note for note in problem.notes if "not checked" in note]
+        assert len(notes) == len(expected)
+        assert all(words in note for words, note in zip(expected, notes, strict=True))
+        assert "joint torques within limits at rest" in [c.describe() for c in problem.constraints]
