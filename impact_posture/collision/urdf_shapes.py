@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import re
 import xml.etree.ElementTree as ET
+import zipfile
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -22,11 +24,20 @@ from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import locate
 from impact_posture.robot.urdf import parse_urdf, quiet_stderr
 
-# A shape larger than 5 m and larger than ten times the robot must be in millimeters.
+# A shape larger than 5 m and larger than ten times the robot is not in meters.
 _LARGEST = 5.0
 _LARGEST_SHARE = 10.0
-# Number of bytes at the start of a COLLADA file in which the up axis is searched.
+# Number of bytes at the start of a mesh file in which the up axis and the unit are searched.
 _HEAD = 10_000
+# The statement of the unit in each mesh format that can state a unit: in meters, or a name.
+_UNIT_TAGS = {
+    ".dae": rb"""<unit\b[^>]*?\bmeter\s*=\s*["']([^"']*)""",
+    ".x3d": rb"""<unit\b(?=[^>]*\bcategory\s*=\s*["']length["'])[^>]*?\bconversionFactor\s*=\s*["']([^"']*)""",
+    ".amf": rb"""<amf\b[^>]*?\bunit\s*=\s*["']([^"']*)""",
+    ".3mf": rb"""<model\b[^>]*?\bunit\s*=\s*["']([^"']*)""",
+}
+# The names of units in AMF and 3MF files, m.
+_UNITS = {"micron": 1e-6, "millimeter": 1e-3, "centimeter": 1e-2, "inch": 0.0254, "feet": 0.3048, "foot": 0.3048}
 # Largest mesh file, bytes, because loading a binary STL takes about 20 times its size in memory.
 _LARGEST_FILE = 100_000_000
 # Attributes with the sizes of each shape type, and the number of values in each attribute.
@@ -80,16 +91,24 @@ class UrdfShape:
     @cached_property
     def y_up(self) -> bool:
         """Whether the mesh is a COLLADA file which states that the y axis is up."""
-        if self.mesh is None or self.mesh.suffix.lower() != ".dae":
-            return False
-        with self.mesh.open("rb") as file:
-            return b"<up_axis>Y_UP" in file.read(_HEAD)
+        return self.mesh is not None and self.mesh.suffix.lower() == ".dae" and b"<up_axis>Y_UP" in _head(self.mesh)
+
+    @cached_property
+    def unit(self) -> float:
+        """Unit of length that the mesh file states, m; 1 if it states none."""
+        tag = None if self.mesh is None else _UNIT_TAGS.get(self.mesh.suffix.lower())
+        stated = re.search(tag, _head(self.mesh)) if self.mesh and tag else None
+        text = "1" if stated is None else stated[1].decode("latin-1").strip().lower()
+        with suppress(ValueError):
+            unit = _UNITS.get(text) or float(text)
+            return unit if 0 < unit < float("inf") else 1.0
+        return 1.0
 
     def load(self, largest: float) -> Corrected:
         """Return the coal shape, and whether it is exact or a convex hull; reject shapes larger than ``largest`` (m).
 
         Raises:
-            UnusableShape: The mesh cannot be read, is empty, has numbers that are not finite, or is in millimeters.
+            UnusableShape: The mesh cannot be read, is empty, has numbers that are not finite, or is not in meters.
         """
         if self.kind == "mesh":
             return self._load_mesh(largest)
@@ -101,7 +120,7 @@ class UrdfShape:
         try:
             with quiet_stderr():
                 # Use a new loader every time, because a loader keeps all meshes in memory.
-                shape = coal.MeshLoader().load(str(self.mesh), np.array(self.sizes))
+                shape = coal.MeshLoader().load(str(self.mesh), self.unit * np.array(self.sizes))
         except Exception:  # The mesh library assimp may raise any exception.
             raise UnusableShape(f"{self.mesh} cannot be read as a mesh, or is empty; export it again") from None
         points = mesh_points(shape)
@@ -111,13 +130,14 @@ class UrdfShape:
         if extent <= 0:
             raise UnusableShape(f"{self.mesh} has no extent; export it again")
         if extent > largest:
-            hint = 'give it in meters or write scale="0.001 0.001 0.001"'
-            raise UnusableShape(f"{self.mesh} is {extent:.3g} m large, so it is in millimeters; {hint}")
+            stated = f" with the unit of {self.unit:g} m that it states" if self.unit != 1 else ""
+            hint = 'give its <mesh> a scale, such as scale="0.001 0.001 0.001" for millimeters'
+            raise UnusableShape(f"{self.mesh} is {extent:.3g} m large{stated}, so it is not in meters; {hint}")
         return correct(shape)
 
 
 def largest_extent(robot: Robot) -> float:
-    """Return the extent (m) above which a shape must be in millimeters: 5 m, or ten times the robot if larger."""
+    """Return the extent (m) above which a shape is not in meters: 5 m, or ten times the robot if larger."""
     data = robot.model.createData()
     pin.forwardKinematics(robot.model, data, robot.posture())
     points = [data.oMi[i].act(np.array(robot.model.inertias[i].lever)) for i in range(1, robot.model.njoints)]
@@ -156,6 +176,16 @@ def read_urdf_shapes(robot: Robot, first: str = "collision") -> UrdfShapes:
             except UnusableShape as fault:
                 read.warnings.append(left_out(unique, fault))
     return read
+
+
+def _head(mesh: Path) -> bytes:
+    """Return the first bytes of a mesh file, or of the model inside a 3MF archive."""
+    if mesh.suffix.lower() == ".3mf":
+        with zipfile.ZipFile(mesh) as archive:
+            models = [name for name in archive.namelist() if name.endswith(".model")]
+            return archive.open(models[0]).read(_HEAD) if models else b""
+    with mesh.open("rb") as file:
+        return file.read(_HEAD)
 
 
 def left_out(name: str, fault: UnusableShape) -> str:

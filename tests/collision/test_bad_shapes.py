@@ -85,7 +85,7 @@ def mesh(name: str, scale: str = "") -> str:
     ("empty file", "cannot be read as a mesh, or is empty"),
     ("text", "cannot be read as a mesh, or is empty"),
     ("one point", "cannot be read as a mesh, or is empty"),
-    ("millimeters", "so it is in millimeters; give it in meters or write scale"),
+    ("millimeters", "so it is not in meters; give its <mesh> a scale"),
     ("missing", "no mesh 'bad.stl'; correct the path"),
     ("folder", "no mesh 'bad.stl'; correct the path"),
 ])  # fmt: skip

@@ -59,7 +59,7 @@ def test_a_shape_for_every_link_needs_no_warning(folder: Path) -> None:
 @pytest.mark.parametrize(("content", "fault"), [
     ("missing", "no mesh 'jib.stl'; correct the path"),
     ("empty", "cannot be read as a mesh, or is empty"),
-    ("millimeters", "so it is in millimeters"),
+    ("millimeters", "so it is not in meters"),
 ])  # fmt: skip
 def test_a_mesh_that_is_left_out_is_a_warning(folder: Path, content: str, fault: str) -> None:
     if content != "missing":
