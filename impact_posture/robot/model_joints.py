@@ -53,6 +53,14 @@ def movable_joints(model: pin.Model) -> list[str]:
     return [str(name) for name in model.names if name not in ("universe", "root_joint")]
 
 
+def immovable_joints(model: pin.Model) -> list[str]:
+    """Return the names of the joints whose position limits are equal."""
+    scalar = [index for index in joint_range(model) if model.nqs[index] == 1]
+    at = [int(model.idx_qs[index]) for index in scalar]
+    equal = model.lowerPositionLimit[at] == model.upperPositionLimit[at]
+    return [str(model.names[index]) for index, same in zip(scalar, equal, strict=True) if same]
+
+
 def rigid_groups(model: pin.Model, held: Sequence[str]) -> list[int]:
     """Return the group number of each joint; links of one group are one body if the joints ``held`` do not move."""
     group = list(range(model.njoints))

@@ -29,8 +29,7 @@ def named_postures(
     """
     postures = _srdf_postures(model, srdf, spec) | _toml_postures(model, spec, root, name)
     default = spec.default_posture or next(iter(postures), "neutral")
-    # If the limits of a joint exclude zero, the joint is at the limit nearest to zero.
-    postures.setdefault("neutral", np.clip(pin.neutral(model), model.lowerPositionLimit, model.upperPositionLimit))
+    postures.setdefault("neutral", _neutral(model))
     if default not in postures:
         fault = f"default_posture '{default}' does not exist"
         raise SpecError(fault, where=name, hint=f"choose one of {', '.join(postures)}")
@@ -59,6 +58,11 @@ def ignored_bases(spec: RobotSpec, srdf: Path | None, default: str) -> tuple[str
     )
 
 
+def _neutral(model: pin.Model) -> Array:
+    """Return the posture with all joints at zero, or at the limit nearest to zero if the limits exclude zero."""
+    return np.clip(pin.neutral(model), model.lowerPositionLimit, model.upperPositionLimit)
+
+
 def _srdf_postures(model: pin.Model, srdf: Path | None, spec: RobotSpec) -> dict[str, Array]:
     if srdf is None:
         return {}
@@ -74,7 +78,7 @@ def _toml_postures(model: pin.Model, spec: RobotSpec, root: Root, name: str) -> 
     result = {}
     for key, posture in spec.postures.items():
         where = f"{name} posture '{key}'"
-        q = np.array(pin.neutral(model), dtype=float)
+        q = _neutral(model)
         if posture.base is not None and spec.model.root != "free-flyer" and root != "free-flyer":
             fault = f"posture '{key}' gives a base pose, but the root is fixed"
             raise SpecError(fault, where=name, hint='remove it, or write root = "free-flyer" in [model]')

@@ -15,10 +15,18 @@ import pinocchio as pin
 from impact_posture.config.checked import checked
 from impact_posture.config.problem_settings import LoadOptions, RobotSettings, Root, Vector3
 from impact_posture.config.table_validation import validate
-from impact_posture.errors import InputError, JointNotFound, PackageNotFound, RobotNotFound, SpecError, UrdfError
+from impact_posture.errors import (
+    InputError,
+    JointNotFound,
+    PackageNotFound,
+    RobotNotFound,
+    SpecError,
+    UrdfError,
+    listed,
+)
 from impact_posture.robot.armature import armature_warning, set_armature
 from impact_posture.robot.inertia_checks import check_mass_matrix, check_moved_mass, massless_joints
-from impact_posture.robot.model_joints import joint_index, movable_joints, q_slice, v_slice
+from impact_posture.robot.model_joints import immovable_joints, joint_index, movable_joints, q_slice, v_slice
 from impact_posture.robot.named_postures import ignored_bases, named_postures
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_spec import RobotSpec, read_spec
@@ -76,6 +84,7 @@ def build_robot(located: Located, options: LoadOptions) -> Robot:
     free = [joint for joint in mimics if model.existJointName(joint) and joint not in spec.constraints.hold]
     coupled = "but moves by itself here, because the coupling is left out; lock it (`lock`) if that matters"
     warnings = (*warnings, *(f"joint '{joint}' mimics '{mimics[joint]}' {coupled}" for joint in free))
+    warnings = (*warnings, *_immovable(model))
     if root == "fixed":
         warnings = (*warnings, *ignored_bases(spec, srdf, default))
     warnings = (*warnings, *armature_warning(model, armature_source, spec.constraints.hold))
@@ -216,6 +225,14 @@ def _check_limits(model: pin.Model, source: str) -> None:
             limits = f"{model.lowerPositionLimit[k]:g}, {model.upperPositionLimit[k]:g}"
             fault = f"the lower position limit of '{model.names[index]}' is above its upper limit ({limits})"
             raise UrdfError(fault, where=source, hint="swap them there, or give robot.toml [limits.position]")
+
+
+def _immovable(model: pin.Model) -> list[str]:
+    """Return a warning about joints whose position limits are equal."""
+    if not (joints := immovable_joints(model)):
+        return []
+    held = f"joints with equal position limits are held at them: {listed(joints)}"
+    return [f"{held}; `lock` them if an impact cannot move them, or state limits in robot.toml [limits.position]"]
 
 
 def _named(model: pin.Model, patterns: Sequence[str], where: str) -> tuple[str, ...]:

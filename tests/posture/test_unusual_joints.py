@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from impact_posture.config.problem_settings import ProblemSettings
 from impact_posture.config.table_validation import validate
 from impact_posture.posture.formulation.problem_file import prepare
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem
+from impact_posture.posture.search.multistart import solve
 from tests.support.urdfs import joint, link, write
 
 LINKS = (link("stand", 5), link("upper", 2, "0.2 0 0"), link("fore", 1.5, "0.2 0 0"), link("palm", 0.5, "0.05 0 0"))
@@ -38,3 +41,24 @@ def test_joints_whose_torque_is_not_checked_are_named(tmp_path: Path) -> None:
         assert len(notes) == len(expected)
         assert all(words in note for words, note in zip(expected, notes, strict=True))
         assert "joint torques within limits at rest" in [c.describe() for c in problem.constraints]
+
+
+def test_a_joint_with_equal_limits_is_held_at_them(tmp_path: Path) -> None:
+    """The posture of robot.toml does not name the joint; the same joint, held in a wide range, is the reference."""
+    arm = (
+        *LINKS, *TIP, link("mid", 1, "0.15 0 0"), joint("a", "stand upper", at="0 0 0.3"),
+        joint("b", "upper fore", at="0.4 0 0"), joint("c", "mid palm", at="0.3 0 0"),
+    )  # fmt: skip
+    wide = joint("k", "fore mid", at="0.4 0 0")
+    equal = wide.replace('lower="-2.5" upper="2.5"', 'lower="0.4" upper="0.4"')
+    problem = posed(tmp_path, *arm, equal)
+    k = problem.robot.joint_names.index("k")
+    assert [line for line in problem.robot.warnings if "equal position limits are held at them: k" in line]
+    assert problem.given[k] == 0.4
+    solution = solve(problem, starts=3, jobs=1, compile="never")
+    toml = BENT.replace("b = 1.2", "b = 1.2, k = 0.4")
+    held = solve(posed(tmp_path, *arm, wide, toml=toml, hold=("k",)), starts=3, jobs=1, compile="never")
+    assert solution.q[k] == 0.4
+    assert solution.redundancy == held.redundancy == 1
+    assert solution.optima[0].objective == pytest.approx(held.optima[0].objective, rel=1e-9)
+    assert solution.certificate.stationarity < 1e-6

@@ -35,6 +35,7 @@ from impact_posture.posture.formulation.impact_constraints import impact_constra
 from impact_posture.posture.formulation.well_posed import fix_undetermined_motions, make_well_posed
 from impact_posture.posture.loads.load_cases import LoadCases, load_cases
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem
+from impact_posture.robot.model_joints import immovable_joints
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_spec import Support
 from impact_posture.robot.support_polygon import polygon_edges
@@ -47,6 +48,9 @@ def build_problem(robot: Robot, objective: Objective, given: Array, requirements
     Raise ``InputError`` if the requirements contradict each other or do not suit the robot.
     """
     _check(robot, requirements)
+    requirements = replace(
+        requirements, hold=tuple(dict.fromkeys((*requirements.hold, *immovable_joints(robot.model))))
+    )
     numeric = Numeric(robot.model).at(given)
     constraints: list[Constraint] = [_held_support(robot, numeric, support) for support in objective.supports]
     held = {s.frame for s in objective.supports}
