@@ -39,15 +39,17 @@ class MeshCheck:
     """Collision check of the shapes of a robot, prepared for many postures.
 
     Overlaps of less than 1 µm are ignored.  Meshes are surfaces, so a mesh entirely inside another does not collide.
+    ``groups`` may contain the group number of each joint: held joints fix shapes of one group, which may touch.
     """
 
-    def __init__(self, robot: Robot, shapes: RobotShapes) -> None:
+    def __init__(self, robot: Robot, shapes: RobotShapes, groups: Sequence[int] = ()) -> None:
         self._model, self._geometry = robot.model, shapes.geometry
         self._data, self._placed = robot.model.createData(), shapes.geometry.createData()
         self._shapes = list(shapes.geometry.geometryObjects)
         for shape in self._shapes:
             shape.geometry.computeLocalAABB()
         self._joints = [int(shape.parentJoint) for shape in self._shapes]
+        self._groups = [groups[k] for k in self._joints] if groups else range(len(self._shapes))
         # A ball around each shape, with its center in the axes of the joint.
         self._centers = [shape.placement.act(shape.geometry.aabb_center) for shape in self._shapes]
         self._reach = np.array([shape.geometry.aabb_radius for shape in self._shapes])
@@ -63,6 +65,8 @@ class MeshCheck:
         if pin.computeCollisions(self._model, self._data, self._geometry, self._placed, q, False):
             for pair, result in zip(self._geometry.collisionPairs, self._placed.collisionResults, strict=True):
                 i, j = pair.first, pair.second
+                if self._groups[i] == self._groups[j]:
+                    continue
                 if result.isCollision() and _deep(shapes[i].geometry, self._at(i), shapes[j].geometry, self._at(j)):
                     collisions.append((shapes[i].name, shapes[j].name))
         if not shapes:

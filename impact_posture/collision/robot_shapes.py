@@ -13,7 +13,7 @@ import pinocchio as pin
 from impact_posture.collision.coal_geometry import Geometry, geometry_key, load_geometry
 from impact_posture.collision.hull_bodies import Body, merged_bodies
 from impact_posture.collision.joint_planes import JointPlanes, joint_planes
-from impact_posture.collision.shape_pairs import Pair, mostly_touching, nested_pairs, pairs_of, touch_of
+from impact_posture.collision.shape_pairs import Pair, nested_pairs, pairs_of, touch_of, touching_by_design
 from impact_posture.collision.swept_hull import Fit, SweptHull, fit_hull
 from impact_posture.collision.urdf_shapes import UrdfShape, read_urdf_shapes
 from impact_posture.config.cached_values import StoredArray, read_stored, write_stored
@@ -31,8 +31,7 @@ class FittedShapes:
     Attributes:
         bodies: Swept hulls that contain all shapes.
         pairs: Pairs of bodies that must not touch, as indices into ``bodies``, shape (k, 2).
-        always_touching: Names of shapes that touch at the default posture and at more than half of 1,000 random
-            postures.  These shapes overlap by design, so their contact is allowed.
+        always_touching: Names of shapes that overlap by design (:func:`touching_by_design`), so they may touch.
         joint_planes: Bounds on joints for nested bodies (:func:`nested_pairs`), which ``pairs`` leaves out.
         hulls_touching: Names of nested bodies without such bounds on joints.  Only :class:`MeshCheck` detects their
             collisions.
@@ -161,7 +160,7 @@ def fit_shapes(robot: Robot, described: list[UrdfShape]) -> FittedShapes:
     tell("fitting collision shapes")
     loaded = load_geometry(robot, described)
     shapes, apart = loaded.model.geometryObjects, loaded.apart
-    touching = mostly_touching(robot, shapes, pairs_of(apart))
+    touching = touching_by_design(robot, shapes, pairs_of(apart))
     for i, j in touching:
         apart[i, j] = apart[j, i] = False
     merged = merged_bodies(shapes, apart)

@@ -1,4 +1,4 @@
-"""Pairs of shapes that must not touch, and pairs that touch at more than half of random postures."""
+"""Pairs of shapes that must not touch, and pairs that touch by design."""
 
 from __future__ import annotations
 
@@ -12,14 +12,17 @@ from numpy.typing import NDArray
 
 from impact_posture.collision.swept_hull import SweptHull, separation, transform
 from impact_posture.errors import UrdfError
+from impact_posture.robot.model_joints import v_slice
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import locate, srdf_path
 from impact_posture.system.arrays import Array
 
-# Number of random postures in mostly_touching, and in nested_pairs.
+# Number of random postures in touching_by_design, and in nested_pairs.
 _POSTURES = 1000
 _COUNTED = 100
 _SEED = 0
+# Smallest singular value of the directions of sliding joints that are not parallel.
+_PARALLEL = 1e-6
 
 Pair = tuple[int, int]
 
@@ -43,19 +46,35 @@ def pairs_of(apart: NDArray[np.bool_]) -> list[Pair]:
     return [(int(i), int(j)) for i, j in np.argwhere(np.triu(apart))]
 
 
-def mostly_touching(robot: Robot, shapes: Sequence[pin.GeometryObject], pairs: list[Pair]) -> list[Pair]:
-    """Return the pairs of shapes that touch at the default and at more than half of 1,000 random postures.
+def touching_by_design(robot: Robot, shapes: Sequence[pin.GeometryObject], pairs: list[Pair]) -> list[Pair]:
+    """Return the pairs of shapes that overlap by design, for example the covers of a wrist.
 
-    Such shapes overlap by design, for example the covers of a wrist.
+    These shapes touch at the default posture and at more than half of 1,000 random postures.  Parts of a telescope,
+    where one slides in the other along one line, need to touch only at a named posture.
     """
     data, touch = robot.model.createData(), touch_of(shapes)
+    sliding = [pair for pair in pairs if _telescopic(robot.model, *(shapes[k].parentJoint for k in pair))]
+    nested: set[Pair] = set()
+    for q in robot.postures.values() if sliding else ():
+        pin.forwardKinematics(robot.model, data, q)
+        nested.update(pair for pair in sliding if touch(pair, data))
     pin.forwardKinematics(robot.model, data, robot.posture())
-    count = {pair: 0 for pair in pairs if touch(pair, data)}
+    count = {pair: 0 for pair in pairs if pair not in nested and touch(pair, data)}
     for q in random_postures(robot, _POSTURES) if count else ():
         pin.forwardKinematics(robot.model, data, q)
         for pair in count:
             count[pair] += touch(pair, data)
-    return [pair for pair, touched in count.items() if touched > _POSTURES / 2]
+    return [pair for pair in pairs if pair in nested or count.get(pair, 0) > _POSTURES / 2]
+
+
+def _telescopic(model: pin.Model, first: int, second: int) -> bool:
+    """Return whether one joint carries the other, and all joints between them slide along the same direction."""
+    carried, carrier = (set(model.supports[k]) for k in sorted((first, second), reverse=True))
+    if not carrier < carried:
+        return False
+    columns = [k for joint in carried - carrier for k in range(*v_slice(model, joint).indices(model.nv))]
+    J = np.array(pin.computeJointJacobians(model, model.createData(), pin.neutral(model)))[:, columns]
+    return not J[3:].any() and np.linalg.matrix_rank(J, _PARALLEL) == 1
 
 
 def nested_pairs(

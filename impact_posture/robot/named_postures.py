@@ -60,7 +60,7 @@ def ignored_bases(spec: RobotSpec, srdf: Path | None, default: str) -> tuple[str
 
 def _neutral(model: pin.Model) -> Array:
     """Return the posture with all joints at zero, or at the limit nearest to zero if the limits exclude zero."""
-    return np.clip(pin.neutral(model), model.lowerPositionLimit, model.upperPositionLimit)
+    return np.asarray(np.clip(pin.neutral(model), model.lowerPositionLimit, model.upperPositionLimit))
 
 
 def _srdf_postures(model: pin.Model, srdf: Path | None, spec: RobotSpec) -> dict[str, Array]:

@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from impact_posture.collision.robot_shapes import RobotShapes, load_shapes
 from impact_posture.config.problem_settings import ProblemSettings
 from impact_posture.config.table_validation import validate
+from impact_posture.dynamics.numeric import Numeric
 from impact_posture.posture.formulation.problem_file import prepare
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem
+from impact_posture.posture.search.growing_search import feasible
 from impact_posture.posture.search.multistart import solve
-from tests.support.urdfs import joint, link, write
+from tests.support.urdfs import MOVED, joint, link, load, write
 
 LINKS = (link("stand", 5), link("upper", 2, "0.2 0 0"), link("fore", 1.5, "0.2 0 0"), link("palm", 0.5, "0.05 0 0"))
 TIP = (link("tip"), joint("tip_mount", "palm tip", None, "0.1 0 0", "fixed", ""))
 BENT = "[postures.bent]\njoints = { a = -0.9, b = 1.2, c = 0.5 }\n"
 
 
-def posed(folder: Path, *elements: str, toml: str = BENT, **settings: object) -> ConstrainedProblem:
+def posed(folder: Path, *elements: str, toml: str = BENT, **settings: Any) -> ConstrainedProblem:
     path = write(folder, *elements, toml=toml)
     values = {"robot": str(path), "frame": "tip", "normal": (0.0, 0.0, 1.0), "contact_pose": "position"}
     return prepare(validate(ProblemSettings, {**values, **settings}, "options")).problem
@@ -62,3 +66,57 @@ def test_a_joint_with_equal_limits_is_held_at_them(tmp_path: Path) -> None:
     assert solution.redundancy == held.redundancy == 1
     assert solution.optima[0].objective == pytest.approx(held.optima[0].objective, rel=1e-9)
     assert solution.certificate.stationarity < 1e-6
+
+
+def gripper(folder: Path, gap: float, **settings: Any) -> ConstrainedProblem:
+    """Return a problem with two fingers, a plate each, that are ``gap`` (m) apart when closed."""
+    at = 0.006 + gap / 2
+    slide = MOVED.replace("-2.5", "0").replace("2.5", "0.04")
+    fingers = [
+        part
+        for side, name in ((1, "left"), (-1, "right"))
+        for part in (
+            link(name, 0.05, "0.04 0 0", box="0.06 0.012 0.02"),
+            joint(f"{name}_joint", f"palm {name}", f"0 {side} 0", f"0.08 {side * at} 0", "prismatic", slide),
+        )
+    ]
+    arm = joint("a", "stand upper", at="0 0 0.3"), joint("b", "upper fore", at="0.4 0 0")
+    return posed(folder, *LINKS, *TIP, *arm, joint("c", "fore palm", at="0.4 0 0"), *fingers, **settings)
+
+
+@pytest.mark.parametrize(("gap", "noted"), [(-0.0004, True), (0.0, True), (0.002, False)])
+def test_held_fingers_may_touch(tmp_path: Path, gap: float, noted: bool) -> None:
+    """Nothing can open held fingers, so their pair is a note, also for shapes that overlap."""
+    problem = gripper(tmp_path, gap, hold=("left_joint", "right_joint"))
+    assert any("held joints fix them: left / right" in note for note in problem.notes) == noted
+    assert "self-collision" not in [c.name for c in problem.constraints]
+    assert problem.surroundings is not None and not problem.surroundings.collisions(problem.given)
+    assert feasible(problem, problem.given)
+
+
+def test_fingers_that_move_are_kept_apart(tmp_path: Path) -> None:
+    problem = gripper(tmp_path, 0.0)
+    assert not [note for note in problem.notes if "left / right" in note]
+    (clearance,) = [c for c in problem.constraints if c.name == "self-collision"]
+    assert clearance.rows == 1
+    assert clearance.value(Numeric(problem.robot.model).at(problem.given))[0] == pytest.approx(-0.001, abs=1e-7)
+
+
+def test_parts_of_a_telescope_may_overlap(tmp_path: Path) -> None:
+    """Three slides along x; a slide along y is not a telescope, and its pairs stay."""
+    slide = MOVED.replace("-2.5", "0").replace("2.5", "0.25")
+    sizes = (0.09, 0.07, 0.05, 0.03)
+    links = [link(f"boom{k}", 1, "0.2 0 0", box=f"0.3 {w} {w}") for k, w in enumerate(sizes)]
+
+    def telescope(second_axis: str) -> RobotShapes:
+        axes = ("1 0 0", second_axis, "-1 0 0")
+        slides = [
+            joint(f"slide{k}", f"boom{k - 1} boom{k}", axis, "0.02 0 0", "prismatic", slide)
+            for k, axis in enumerate(axes, 1)
+        ]
+        return load_shapes(load(tmp_path, link("stand", 5), *links, joint("turn", "stand boom0", "0 0 1"), *slides))
+
+    nested = {("boom0", "boom2"), ("boom0", "boom3"), ("boom1", "boom3")}
+    assert {*telescope("1 0 0").always_touching} == nested
+    assert not len(telescope("1 0 0").pairs)
+    assert ("boom0", "boom3") not in telescope("0 1 0").always_touching

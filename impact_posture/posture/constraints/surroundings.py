@@ -16,7 +16,7 @@ from impact_posture.config.obstacle import Obstacle
 from impact_posture.config.problem_settings import PATCH
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import PointOnLink
-from impact_posture.errors import InputError
+from impact_posture.errors import InputError, listed
 from impact_posture.impact.impact_contact import ImpactContact, point_on
 from impact_posture.posture.constraints.clearance import Clearance
 from impact_posture.posture.constraints.nested_links import NestedLinks
@@ -52,17 +52,21 @@ class Surroundings:
 
     def __init__(self, robot: Robot, numeric: Numeric, held: Sequence[str], clearance: float) -> None:
         self.robot, self.shapes = robot, load_shapes(robot)
-        self._clearance, self._numeric = clearance, numeric
+        self._clearance, self._numeric, self._held = clearance, numeric, frozenset(held)
         self._bodies = [ConvexBody.of_link(hull) for hull in self.shapes.bodies]
         self._group = rigid_groups(robot.model, held)
+        pairs = [SeparatingPlane(self._bodies[i], self._bodies[j], clearance) for i, j in self.shapes.pairs]
+        self._pairs = [pair for pair in pairs if not self._fixed(pair)]
         self._walls: list[_Wall] = []
         self._still = {0}
         self._depths: dict[ImpactContact, float] = {}
         self.notes: list[str] = []
         if touching := self.shapes.always_touching:
-            pairs = [*(" / ".join(pair) for pair in touching[:3]), *["…"] * (len(touching) > 3)]
-            text = "pairs of shapes may touch, because they touch at the default posture and most others"
-            self.notes.append(f"{len(touching)} {text}: {', '.join(pairs)}")
+            text = "shapes may touch, because they slide in each other, or touch at most postures"
+            self.notes.append(f"{text}: {listed([' / '.join(pair) for pair in touching], 3)}")
+        if near := [pair.name for pair in pairs if self._fixed(pair) and pair.distance(numeric)[0] < 0]:
+            text = f"shapes closer than {1e3 * clearance:g} mm are not kept apart, because held joints fix them"
+            self.notes.append(f"{text}: {listed(near, 3)}")
 
     def add_ground(self, supports: Sequence[Support], struck: Sequence[ImpactContact]) -> None:
         """Put level ground at the height of the lowest foot; the feet and the struck links may touch the ground."""
@@ -149,14 +153,14 @@ class Surroundings:
     @cached_property
     def nested(self) -> list[NestedLinks]:
         """Constraints on pairs of links whose convex hulls overlap (:class:`NestedLinks`)."""
-        return [NestedLinks(self.robot, planes) for planes in self.shapes.joint_planes if len(planes.bounds)]
+        planes = [planes for planes in self.shapes.joint_planes if len(planes.bounds)]
+        return [NestedLinks(self.robot, some) for some in planes if not {*some.joints} <= self._held]
 
     @cached_property
     def constraints(self) -> list[Clearance]:
         """One constraint for the distances between links, and one for each plane or body around the robot."""
         near = f"at least {1e3 * self._clearance:g} mm apart"
-        pairs = [SeparatingPlane(self._bodies[i], self._bodies[j], self._clearance) for i, j in self.shapes.pairs]
-        groups = [("self-collision", pairs, f"links {near} ({len(pairs)} pairs)")]
+        groups = [("self-collision", self._pairs, f"links {near} ({len(self._pairs)} pairs)")]
         for wall in self._walls:
             apart = [b for b in self._bodies if b.point.joint not in wall.exempt]
             pairs = [SeparatingPlane(body, wall.body, self._clearance) for body in apart]
@@ -201,7 +205,7 @@ class Surroundings:
 
     @cached_property
     def _meshes(self) -> MeshCheck:
-        return MeshCheck(self.robot, self.shapes)
+        return MeshCheck(self.robot, self.shapes, self._group)
 
     def walls_at(self, q: Array) -> tuple[list[HalfSpace], list[tuple[SweptHull, pin.SE3, frozenset[int]]]]:
         """Return the planes, and the bodies with their placements, around the robot at ``q``.
@@ -227,6 +231,10 @@ class Surroundings:
                 return body.name
         root = PointOnLink(0, self.robot.model.jointPlacements[1].translation, np.eye(3))
         return "the base" if not self.robot.floating and self._above(root, plane) < -_BEHIND else ""
+
+    def _fixed(self, pair: SeparatingPlane) -> bool:
+        """Return whether held joints fix the two bodies to each other."""
+        return self._group[pair.a.point.joint] == self._group[pair.b.point.joint]
 
     def _rigid(self, joints: Iterable[int]) -> frozenset[int]:
         """Return all joints whose links are fixed relative to the link of any joint in ``joints``."""

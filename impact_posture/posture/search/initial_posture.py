@@ -39,10 +39,13 @@ def initial_posture(problem: ConstrainedProblem, seed: int, rows: ProgramRows) -
         limits = f"; there {', '.join(least.at_limits[:4])}" if least.at_limits else ""
         sign = "; check the sign of the normal, which points towards the robot, and how far the `surface` reaches"
         struck = sign if any(" / surface at " in name for name in least.conflicts) else ""
+        links = {body.name for body in problem.surroundings.shapes.bodies} if problem.surroundings else set()
+        overlap = any({*name.split(" / ")} <= links for name in least.conflicts)
+        design = "; links that touch by design may touch by <disable_collisions> in an SRDF" if overlap else ""
         raise Infeasible(
             least.conflicts,
             hint=f"{_turn_hint(problem, seed)}relax one of them, move the target, or start from another `posture`"
-            f"{struck}{limits}",
+            f"{struck}{design}{limits}",
         )
     projection = Projector(problem).project(least.q)
     if projection.violation > FEASIBLE:
