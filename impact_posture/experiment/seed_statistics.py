@@ -11,7 +11,7 @@ from scipy.special import stdtrit
 
 from impact_posture.experiment.jobs import Document
 from impact_posture.impact.evaluation.impact_effect import ImpactLoad, WorstJoint, worst_joint
-from impact_posture.posture.analysis.verdict_changes import changes, outcome_of, relative_change
+from impact_posture.posture.analysis.verdict_changes import changes, outcome_of
 from impact_posture.simulation.metrics import Metrics
 from impact_posture.simulation.outcome import Outcome, gravest
 
@@ -136,9 +136,8 @@ def _outcome(row: Document, nominal: Document) -> str:
     doubtful = {name for name, each in intervals.items() if each.shown is not None and abs(each.mean) <= each.shown}
     before = {name: float(interval["mean"]) for name, interval in nominal["metrics"].items()}
     after = {name: before[name] + (0.0 if name in doubtful else each.mean) for name, each in intervals.items()}
-    force = relative_change(before["peak_force"], after["peak_force"])
     first, last = (_load(values, nominal["joint"]) for values in (before, after))
-    outcome = outcome_of(changes(first, last, row["approach"] or 0.0, force))
+    outcome = outcome_of(changes(first, last, row["approach"] or 0.0))
     compared = {field.name for field in fields(ImpactLoad)} | {"joint_velocity", "joint_share"}
     return f"the impact itself is {outcome}{' beyond the intervals' if doubtful & compared else ''}"
 

@@ -231,9 +231,7 @@ def compression(
             x = contact.compression_time(links, speed) / sqrt(links * C)
         elif speed > 0:
             each = {name: ContactStiffness(hertz=hertz_stiffness(name)) for name in MATERIALS}
-            by_material = {
-                name: steel.compression_time(links, speed) / sqrt(links * C) for name, steel in each.items()
-            }
+            by_material = {name: tip.compression_time(links, speed) / sqrt(links * C) for name, tip in each.items()}
     if x is not None and not np.isfinite(x):
         x = None
     return Compression(contact, mass, time, force, x, by_material, objective.robot.joint_model, unknown)

@@ -80,12 +80,14 @@ def verdict(
         why = "there is no approach speed" if impact.speed <= 0 else "the contact cannot move along the normal"
         line = "; ".join(filter(None, [opening, f"no verdict, because {why}"]))
         return Verdict("unknown", f"verdict: {line}.", conditions=stated)
-    sides, force = (_predicted(before, first), _predicted(after, last)), _force_change(before, after)
+    sides = _predicted(before, first), _predicted(after, last)
     unilateral = _unilateral(impact, (before, after), sides)
-    felt = changes(*sides, impact.speed, force, f" at {impact.contact.frame}" if together else "")
-    outcome = outcome_of(felt)
-    contact = f"with friction {impact.contact.friction:g}" if isinstance(last, CoulombJump) else "without friction"
-    contact += _slip(last)
+    known_mass = before.contact_mass is not None and after.contact_mass is not None
+    linear = _linear_force(impact, sides) if known_mass else None
+    felt = changes(*sides, impact.speed, linear, f" at {impact.contact.frame}" if together else "")
+    outcome, force = outcome_of(felt), next((change.relative for change in felt if change.side == "force"), None)
+    friction = f"with friction {impact.contact.friction:g}" if isinstance(last, CoulombJump) else "without friction"
+    contact = friction + _slip(last)
     if impact.objective.others:
         contact += ", all contacts at once" if together else f", at {impact.contact.frame} alone"
     numbers = [change.line for change in felt]
@@ -113,7 +115,7 @@ def verdict(
         before=sides[0],
         after=sides[1],
         unilateral=unilateral,
-        assumptions=_assumptions(impact, last, together, force),
+        assumptions=_assumptions(impact, friction, together, force),
     )
 
 
@@ -135,7 +137,7 @@ def _unilateral(
     differ = [
         change.grows or change.falls
         for pair in zip(held, sides, strict=True)
-        for change in changes(*pair, impact.speed, None)
+        for change in changes(*pair, impact.speed)
     ]
     return sides if first.moves or last.moves or any(differ) else None
 
@@ -151,11 +153,7 @@ def _lifted(impact: ResolvedImpact, sides: tuple[PredictedImpact, PredictedImpac
     """Return a sentence with the outcome and the numbers if the feet can lift and slide; empty without ``sides``."""
     if sides is None:
         return ""
-    first, last = sides
-    force = None if impact.objective.others else sqrt(last.impulse / first.impulse) - 1
-    if first.peak_force is not None and last.peak_force is not None:
-        force = relative_change(first.peak_force, last.peak_force)
-    felt = changes(first, last, impact.speed, force)
+    felt = changes(*sides, impact.speed, _linear_force(impact, sides))
     return f" With feet that lift or slide: {outcome_of(felt)}, {', '.join(change.line for change in felt)}."
 
 
@@ -179,14 +177,13 @@ def _felt(jump: Jump, peak_force: float | None) -> PredictedImpact:
 
 def _minimized(impact: ResolvedImpact, jumps: tuple[Jump, Jump]) -> str:
     metric = impact.objective.metric.kind
-    mixed = "" if metric == "kinetic" else ", m/s and rad/s in one norm,"
+    mixed = "" if metric == "kinetic" else ", m/s and rad/s in one norm"
     change = in_words(relative_change(jumps[0].norm, jumps[1].norm))
-    norm = f"‖Δν‖ ({metric}{mixed.rstrip(',')}) {change} ({jumps[0].norm:.3g} to {jumps[1].norm:.3g})"
+    norm = f"‖Δν‖ ({metric}{mixed}) {change} ({jumps[0].norm:.3g} to {jumps[1].norm:.3g})"
     return f"minimized: {impact.objective.kind}; the whole jump {norm}"
 
 
-def _assumptions(impact: ResolvedImpact, jump: Jump, together: bool, force: float | None) -> tuple[str, ...]:
-    friction = f"with friction {impact.contact.friction:g}" if isinstance(jump, CoulombJump) else "without friction"
+def _assumptions(impact: ResolvedImpact, friction: str, together: bool, force: float | None) -> tuple[str, ...]:
     # Impacts at several contacts at the same time are treated as plastic.
     restitution = 0.0 if together else impact.restitution
     stated = "the stated contact" if impact.contact_stiffness else "a linear contact, the same before and after"
@@ -208,13 +205,9 @@ def _slip(jump: Jump) -> str:
     return "" if not isinstance(jump, CoulombJump) else ", sticking" if jump.sticks else ", slipping"
 
 
-def _force_change(before: Evaluation, after: Evaluation) -> float | None:
-    if before.contacts or before.contact_mass is None or after.contact_mass is None:
-        return None
-    first, second = before.compression, after.compression
-    if first and second and first.peak_force is not None and second.peak_force is not None:
-        return relative_change(first.peak_force, second.peak_force)
-    return sqrt(after.contact_mass / before.contact_mass) - 1
+def _linear_force(impact: ResolvedImpact, sides: tuple[PredictedImpact, PredictedImpact]) -> float | None:
+    """Return the relative change of the peak force of a linear contact; ``None`` for several contacts."""
+    return None if impact.objective.others else sqrt(sides[1].impulse / sides[0].impulse) - 1
 
 
 def _without_friction(before: Evaluation, after: Evaluation, jump: float) -> Iterator[str]:

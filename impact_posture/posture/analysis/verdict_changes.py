@@ -57,11 +57,12 @@ class Change:
 
 
 def changes(
-    before: ImpactLoad, after: ImpactLoad, speed: float, force: float | None, where: str = ""
+    before: ImpactLoad, after: ImpactLoad, speed: float, force: float | None = None, where: str = ""
 ) -> tuple[Change, ...]:
-    """Return the changes from one impact to another; ``force`` is the relative change of the peak force.
+    """Return the changes from one impact to another; ``speed`` is the approach speed, m/s.
 
-    ``speed`` is the approach speed, m/s, and ``where`` names the contact of the impulse if there are several.
+    ``force`` is the relative change of the peak force of a linear contact, for impacts of unknown peak force.
+    ``where`` names the contact of the impulse if there are several.
     """
     return (*_velocities(before, after, FELT * speed), *_contact(before, after, force, where))
 
@@ -92,11 +93,13 @@ def _contact(before: ImpactLoad, after: ImpactLoad, force: float | None, where: 
     impulse = relative_change(before.impulse, after.impulse)
     seconds = f"{before.impulse:.3g} to {after.impulse:.3g} N·s"
     yield Change("impulse", impulse, f"normal impulse{where} {seconds} ({_sign(impulse)})")
-    if force is None:
-        return
-    newtons = f"(linear contact) {_sign(force)}"
     if before.peak_force is not None and after.peak_force is not None:
+        force = relative_change(before.peak_force, after.peak_force)
         newtons = f"{before.peak_force:.3g} to {after.peak_force:.3g} N ({_sign(force)})"
+    elif force is not None:
+        newtons = f"(linear contact) {_sign(force)}"
+    else:
+        return
     yield Change("force", force, f"peak force {newtons}")
 
 
