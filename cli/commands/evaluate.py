@@ -94,7 +94,7 @@ def _ellipsoids(page: Page, impact: ResolvedImpact, ellipsoids: dict[str, Ellips
     kinetic = impact.metric.kind == "kinetic"
     rows = []
     for name, ellipsoid in ellipsoids.items():
-        for k, radius in enumerate(ellipsoid.finite_radii):
+        for k, radius in enumerate(ellipsoid.to_dict()["radii"]):
             unit = units.get(name, "kg^-1/2" if kinetic else "jump/(N·s)") if k == 0 else ""
             axis = vector(ellipsoid.axes[:, k])
             rows.append((f"  {name}" if k == 0 else "", number(radius, missing="unbounded"), unit, axis))

@@ -30,7 +30,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
-from impact_posture.config.json_block import json_block
+from impact_posture.config.json_block import JsonBlock
 from impact_posture.errors import ContactError, InputError
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.impact_contact import LARGEST
@@ -50,7 +50,7 @@ _SAMPLE, _FEWEST, _MOST = 0.1, 100, 20_000
 
 
 @dataclass(frozen=True, eq=False)
-class ElasticResponse:
+class ElasticResponse(JsonBlock):
     """Response of links, rotors and springs to a contact, from touch to the greatest compression at the time ``T``.
 
     All quantities are proportional to ``speed``, except ``stiffness``, ``duration``, ``compliance_ratio`` and
@@ -89,11 +89,6 @@ class ElasticResponse:
     rotor_jump: Array
     torque: Array
     peak_torque: Array
-
-    def to_dict(self) -> dict[str, object]:
-        """Return JSON content, with ``None`` for an infinite compliance ratio."""
-        ratio = self.compliance_ratio if math.isfinite(self.compliance_ratio) else None
-        return json_block(self) | {"compliance_ratio": ratio}
 
 
 class ElasticImpact:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from impact_posture.config.json_block import json_block
+from impact_posture.config.json_block import JsonBlock
 from impact_posture.impact.evaluation.impact_effect import tangent_units
 from impact_posture.impact.quantities.impact_quantities import ImpactQuantities
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
@@ -12,7 +12,7 @@ from impact_posture.robot.model_joints import v_slice
 
 
 @dataclass(frozen=True)
-class Dominance:
+class Dominance(JsonBlock):
     """Whether one light joint makes up most of ``H``.
 
     Attributes:
@@ -26,15 +26,12 @@ class Dominance:
     share: float
     base: float
     line: str
+    derived = ("dominates",)
 
     @property
     def dominates(self) -> bool:
         """Whether the largest share is above one half."""
         return self.share > 0.5
-
-    def to_dict(self) -> dict[str, object]:
-        """Return JSON content."""
-        return json_block(self) | {"dominates": self.dominates}
 
 
 def find_dominance(objective: WorstCaseObjective, quantities: ImpactQuantities) -> Dominance:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from impact_posture.config.json_block import JsonBlock
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.system.arrays import Array
 
@@ -14,7 +15,7 @@ _RANK = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
-class Ellipsoid:
+class Ellipsoid(JsonBlock):
     """An ellipsoid about the contact point.
 
     Attributes:
@@ -24,15 +25,6 @@ class Ellipsoid:
 
     axes: Array
     radii: Array
-
-    @property
-    def finite_radii(self) -> list[float | None]:
-        """The radii, with ``None`` for an infinite radius."""
-        return [float(r) if np.isfinite(r) else None for r in self.radii]
-
-    def to_dict(self) -> dict[str, object]:
-        """Return JSON content, with ``None`` for an infinite radius."""
-        return {"axes": self.axes.tolist(), "radii": self.finite_radii}
 
 
 def ellipsoid_of(matrix: Array) -> Ellipsoid:

@@ -11,7 +11,7 @@ import pinocchio as pin
 
 from impact_posture.config.checked import checked
 from impact_posture.config.demand import Share, between
-from impact_posture.config.json_block import json_block
+from impact_posture.config.json_block import JsonBlock
 from impact_posture.config.problem_settings import RESTITUTION, SPEED
 from impact_posture.errors import InputError, MetricError
 from impact_posture.impact.elasticity.contact_compression import (
@@ -49,7 +49,7 @@ _SOFT = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class Evaluation:
+class Evaluation(JsonBlock):
     """All quantities of one impact at one posture.
 
     Attributes:
@@ -131,7 +131,7 @@ class Evaluation:
 
     def to_dict(self) -> dict[str, object]:
         """Return the ``initial`` or ``optimal`` block of ``result.json``; undefined values are ``None``."""
-        content, quaternion = json_block(self), pin.Quaternion(self.pose.rotation)
+        content, quaternion = super().to_dict(), pin.Quaternion(self.pose.rotation)
         block: dict[str, object] = {
             **{key: content[key] for key in ("q", "objective")},
             **content["scalars"],

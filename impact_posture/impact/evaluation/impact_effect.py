@@ -7,14 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from impact_posture.config.json_block import json_block
+from impact_posture.config.json_block import JsonBlock
 from impact_posture.dynamics.joints import joint_kind
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 
 
 @dataclass(frozen=True)
-class WorstJoint:
+class WorstJoint(JsonBlock):
     """The joint with the largest ratio of velocity jump to velocity limit.
 
     Attributes:
@@ -30,13 +30,9 @@ class WorstJoint:
     unit: str
     share: float | None
 
-    def to_dict(self) -> dict[str, object]:
-        """Return JSON content."""
-        return json_block(self)
-
 
 @dataclass(frozen=True)
-class ImpactEffect:
+class ImpactEffect(JsonBlock):
     """Base and worst joint of a velocity jump.
 
     Attributes:
@@ -48,10 +44,6 @@ class ImpactEffect:
     base_linear: float | None
     base_angular: float | None
     joint: WorstJoint | None
-
-    def to_dict(self) -> dict[str, object]:
-        """Return JSON content."""
-        return json_block(self)
 
 
 @dataclass(frozen=True)

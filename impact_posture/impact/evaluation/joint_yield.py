@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from impact_posture.config.json_block import json_block
+from impact_posture.config.json_block import JsonBlock
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.model_joints import v_slice
 from impact_posture.system.arrays import Array, null_space
@@ -17,7 +17,7 @@ _SINGULAR, _RANK = 0.05, 1e-9
 
 
 @dataclass(frozen=True)
-class JointYield:
+class JointYield(JsonBlock):
     """Speed of the contact for a joint velocity of norm 1; the feet do not move, the base only as the joints require.
 
     Attributes:
@@ -28,15 +28,12 @@ class JointYield:
 
     along: float
     largest: float
+    derived = ("singular",)
 
     @property
     def singular(self) -> bool:
         """Whether the joints cannot yield along the normal."""
         return self.along < _SINGULAR * self.largest
-
-    def to_dict(self) -> dict[str, object]:
-        """Return JSON content."""
-        return json_block(self) | {"singular": self.singular}
 
 
 def joint_yield(objective: WorstCaseObjective, q: Array) -> JointYield | None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from impact_posture.config.json_block import json_block
+from impact_posture.config.json_block import JsonBlock
 from impact_posture.impact.elasticity.contact_compression import milliseconds
 from impact_posture.impact.evaluation.velocity_jump import Jump, weighed_jump
 from impact_posture.impact.friction.unilateral_impact import StandingFeet, longest_lifting_time, unilateral_impact
@@ -19,7 +19,7 @@ _LONGEST = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class StandingImpact:
+class StandingImpact(JsonBlock):
     """The predicted impact if the ground can only push the feet.
 
     Attributes:
@@ -58,7 +58,7 @@ class StandingImpact:
 
     def to_dict(self) -> dict[str, object]:
         """Return JSON content."""
-        return json_block(self) | {"line": self.fact}
+        return super().to_dict() | {"line": self.fact}
 
 
 def standing_impact(

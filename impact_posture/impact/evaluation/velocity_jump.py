@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from impact_posture.config.json_block import json_block
+from impact_posture.config.json_block import JsonBlock
 from impact_posture.impact.evaluation.impact_effect import ImpactEffect, impact_effect, tangent_units
 from impact_posture.impact.quantities.impact_quantities import ImpactQuantities
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
@@ -15,7 +15,7 @@ from impact_posture.system.arrays import Array
 
 
 @dataclass(frozen=True, eq=False)
-class Jump:
+class Jump(JsonBlock):
     """A predicted velocity jump.
 
     Attributes:
@@ -42,7 +42,7 @@ class Jump:
     def to_dict(self) -> dict[str, object]:
         """Return JSON content."""
         largest = [{"name": name, "value": value, "unit": unit} for name, value, unit in self.largest]
-        return json_block(self) | {"largest": largest}
+        return super().to_dict() | {"largest": largest}
 
 
 def largest_entries(robot: Robot, values: Array) -> tuple[tuple[str, float, str], ...]:

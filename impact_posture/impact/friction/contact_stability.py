@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from impact_posture.config.json_block import json_block
+from impact_posture.config.json_block import JsonBlock
 from impact_posture.impact.quantities.impact_oracle import ImpactOracle
 from impact_posture.robot.robot_spec import Support
 from impact_posture.system.arrays import Array
@@ -29,7 +29,7 @@ _MOST_FRICTION = 10.0
 
 
 @dataclass(frozen=True, eq=False)
-class FootImpulse:
+class FootImpulse(JsonBlock):
     """Support impulse on one foot per unit impulse of the impact.
 
     Attributes:
@@ -44,13 +44,9 @@ class FootImpulse:
     moment: Array
     lifts: bool
 
-    def to_dict(self) -> dict[str, object]:
-        """Return JSON content."""
-        return json_block(self)
-
 
 @dataclass(frozen=True)
-class ContactStability:
+class ContactStability(JsonBlock):
     """Whether the feet can stay on the ground in an impact.
 
     Attributes:
@@ -79,9 +75,8 @@ class ContactStability:
 
     def to_dict(self) -> dict[str, object]:
         """Return JSON content."""
-        finite = self.friction is not None and np.isfinite(self.friction)
-        friction = self.friction if finite else None
-        return json_block(self) | {"friction": friction, "stays": bool(finite), "verdict": self.line}
+        block = super().to_dict()
+        return block | {"stays": block["friction"] is not None, "verdict": self.line}
 
 
 def contact_stability(oracle: ImpactOracle, supports: tuple[Support, ...], q: Array) -> ContactStability:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from impact_posture.config.json_block import JsonBlock
 from impact_posture.system.arrays import Array
 
 # The contact is treated as immovable along the normal if G is below this fraction of the largest mobility.
@@ -52,7 +53,7 @@ class ImpactQuantities:
 
 
 @dataclass(frozen=True)
-class Scalars:
+class Scalars(JsonBlock):
     """H, G, V, S and E as in :class:`ImpactQuantities`; a value is ``None`` if it does not exist at the posture."""
 
     H: float
@@ -71,7 +72,3 @@ class Scalars:
     def effective_mass(self) -> float | None:
         """Effective mass ``1/G``, kg; ``None`` if it is unbounded (the contact cannot move along the normal)."""
         return None if self.E is None else 1 / self.G
-
-    def to_dict(self) -> dict[str, float | None]:
-        """Return JSON content."""
-        return {"H": self.H, "G": self.G, "V": self.V, "S": self.S, "E": self.E}

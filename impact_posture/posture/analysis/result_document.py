@@ -12,7 +12,6 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impact_posture.config.json_block import json_block
 from impact_posture.posture.analysis.posture_warnings import posture_warnings
 from impact_posture.posture.analysis.robustness import Robustness
 from impact_posture.posture.analysis.trade_off import TradeOff
@@ -82,11 +81,11 @@ def result_document(
         "redundancy": solution.redundancy,
         "certificate": solution.certificate.to_dict(),
         **({"collision": around.to_dict(solution.initial, solution.q)} if around and around.constraints else {}),
-        "active": [json_block(active) for active in solution.certificate.active],
+        "active": [active.to_dict() for active in solution.certificate.active],
         "solver": {
             **{key: getattr(solution, key) for key in _SOLVER},
             "seed": prepared.settings.seed,
-            "optima": [json_block(optimum) for optimum in solution.optima],
+            "optima": [optimum.to_dict() for optimum in solution.optima],
         },
         "search": solution.estimate.to_dict(),
         **({} if global_search is None else {"global": global_search.to_dict()}),

@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from impact_posture.config.json_block import json_block
+from impact_posture.config.json_block import JsonBlock
 from impact_posture.config.problem_settings import STARTS
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import Infeasible, SolverFailed
@@ -30,7 +30,7 @@ _NOISE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class VariantOptimum:
+class VariantOptimum(JsonBlock):
     """A model variant and its own optimum, which is the best posture for this variant alone.
 
     ``at_robust`` is the objective of the variant at the robust optimum.  ``own`` is the objective of the variant at
@@ -47,7 +47,7 @@ class VariantOptimum:
     def to_dict(self) -> dict[str, object]:
         """Return JSON content."""
         keys = {"own": "own_optimum", "q": "own_q"}
-        return {keys.get(key, key): value for key, value in json_block(self).items()}
+        return {keys.get(key, key): value for key, value in super().to_dict().items()}
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from impact_posture.config.json_block import json_block
+from impact_posture.config.json_block import JsonBlock
 from impact_posture.config.problem_settings import Against
 from impact_posture.posture.program.certificate import Certificate
 from impact_posture.system.arrays import Array
@@ -17,7 +17,7 @@ KNEE = 1 / 3
 
 
 @dataclass(frozen=True, eq=False)
-class TradePoint:
+class TradePoint(JsonBlock):
     """The best posture within one bound, with H, G, V and S of its impact; S is ``None`` if undefined.
 
     Attributes:
@@ -40,6 +40,7 @@ class TradePoint:
     S: float | None
     certificate: Certificate
     first: bool = False
+    derived = ("certified",)
 
     @property
     def certified(self) -> bool:
@@ -48,9 +49,7 @@ class TradePoint:
 
     def to_dict(self) -> dict[str, object]:
         """Return JSON content."""
-        finite = self.V if np.isfinite(self.V) else None
-        values = json_block(self) | {"V": finite, "certified": self.certified}
-        return {key: value for key, value in values.items() if key not in ("certificate", "first")}
+        return {key: value for key, value in super().to_dict().items() if key not in ("certificate", "first")}
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from math import sqrt
 
-from impact_posture.config.json_block import json_block
+from impact_posture.config.json_block import JsonBlock
 from impact_posture.impact.elasticity.contact_compression import both_models
 from impact_posture.impact.evaluation.coulomb_jump import CoulombJump, coulomb_jump
 from impact_posture.impact.evaluation.evaluation import Evaluation
@@ -25,7 +25,7 @@ from impact_posture.posture.analysis.verdict_conditions import Circumstances, Co
 
 
 @dataclass(frozen=True)
-class Verdict:
+class Verdict(JsonBlock):
     """Changes from the initial to the optimal posture, at the given approach speed and friction.
 
     Attributes:
@@ -56,10 +56,6 @@ class Verdict:
     after: PredictedImpact | None = None
     unilateral: tuple[PredictedImpact, PredictedImpact] | None = None
     assumptions: tuple[str, ...] = ()
-
-    def to_dict(self) -> dict[str, object]:
-        """Return JSON content."""
-        return json_block(self)
 
 
 def verdict(

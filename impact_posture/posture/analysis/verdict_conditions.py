@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import chain
 
-from impact_posture.config.json_block import json_block
+from impact_posture.config.json_block import JsonBlock
 from impact_posture.impact.elasticity.contact_compression import milliseconds
 from impact_posture.impact.evaluation.evaluation import Evaluation
 from impact_posture.impact.resolved_impact import ResolvedImpact
@@ -23,7 +23,7 @@ _STILL = 1e-6
 
 
 @dataclass(frozen=True)
-class Condition:
+class Condition(JsonBlock):
     """One condition of a verdict.
 
     Attributes:
@@ -37,10 +37,6 @@ class Condition:
     line: str
     hint: str = ""
     refutes: bool = False
-
-    def to_dict(self) -> dict[str, object]:
-        """Return JSON content."""
-        return json_block(self)
 
 
 @dataclass(frozen=True)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from impact_posture.config.json_block import JsonBlock
 from impact_posture.posture.loads.equilibrium import Equilibrium
 from impact_posture.system.arrays import Array
 
@@ -15,7 +16,7 @@ _ROUNDING = 1e-6
 
 
 @dataclass(frozen=True)
-class ActuatorLoad:
+class ActuatorLoad(JsonBlock):
     """Torque (N·m), force of a prismatic joint (N) or thrust (N) of an actuator, with its limits.
 
     ``share`` is the distance of ``value`` from the middle of the range, divided by half the range; it is 1 at a
@@ -29,7 +30,7 @@ class ActuatorLoad:
 
 
 @dataclass(frozen=True)
-class HoldingForces:
+class HoldingForces(JsonBlock):
     """Forces that hold a posture and minimize the largest :attr:`ActuatorLoad.share`.
 
     Attributes:
@@ -89,7 +90,3 @@ class HoldingForces:
                 limits = f"[{load.low:.3g}, {load.high:.3g}]"
                 lines.append(f"{self.load}, {name} would need {load.value:.3g}, outside {limits}")
         return lines + [line for other in self.other_loads for line in other.violations()]
-
-    def to_dict(self) -> dict[str, object]:
-        """Return JSON content."""
-        return asdict(self)

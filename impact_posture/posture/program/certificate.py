@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impact_posture.config.json_block import json_block
+from impact_posture.config.json_block import JsonBlock
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.posture.constraints.constraint import Linearization
@@ -32,7 +32,7 @@ _MULTIPLIER = 1e-6
 
 
 @dataclass(frozen=True)
-class Active:
+class Active(JsonBlock):
     """An active inequality: a constraint, such as ``joint 'elbow'``, and its ``lower`` or ``upper`` side.
 
     ``multiplier`` (≥ 0) is the rate at which the scaled objective decreases if the bound is relaxed, per unit of the
@@ -45,7 +45,7 @@ class Active:
 
 
 @dataclass(frozen=True)
-class Certificate:
+class Certificate(JsonBlock):
     """First-order optimality and feasibility at one posture, computed independently of the solver.
 
     Attributes:
@@ -88,7 +88,7 @@ class Certificate:
 
     def to_dict(self) -> dict[str, object]:
         """Return the ``certificate`` block of ``result.json``."""
-        return {key: value for key, value in json_block(self).items() if key != "active"}
+        return {key: value for key, value in super().to_dict().items() if key != "active"}
 
 
 def certify(

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pinocchio as pin
 
+from impact_posture.config.json_block import JsonBlock
 from impact_posture.config.problem_settings import STARTS
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
@@ -37,7 +38,7 @@ _MANY = 8
 
 
 @dataclass(frozen=True)
-class Optimum:
+class Optimum(JsonBlock):
     """A distinct local optimum: posture, shape (nq,), objective, and number of starts that ended there."""
 
     q: Array

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from impact_posture.config.json_block import JsonBlock
+
 # If no start was alone at its optimum, at most this number of starts in N lead elsewhere, with a confidence of 95 %
 # (rule of three).
 _RULE_OF_THREE = 3
@@ -16,7 +18,7 @@ SAME_VALUE = 5e-3
 
 
 @dataclass(frozen=True)
-class SearchEstimate:
+class SearchEstimate(JsonBlock):
     """What a search reached, and what it may have missed.  Optima with equal objectives count as one.
 
     Attributes:
@@ -40,6 +42,7 @@ class SearchEstimate:
     estimated_optima: float
     bound: bool
     partial: bool
+    derived = ("line",)
 
     @staticmethod
     def of(
@@ -62,10 +65,6 @@ class SearchEstimate:
         ignored = " if they ignore clearances and loads" if self.partial else ""
         reached = f"{starts}{hops} reached optima with {optima}, the best {times}"
         return f"{reached}; {elsewhere} of further starts would lead to another objective{ignored}"
-
-    def to_dict(self) -> dict[str, object]:
-        """Return the block ``search`` of ``result.json``."""
-        return {**vars(self), "line": self.line}
 
 
 def _percent(share: float) -> str:
