@@ -106,6 +106,7 @@ def _executor(
     workers: int, scheduler: str | None, slurm: list[str] | None, out: Path, *, mpi: bool
 ) -> AbstractContextManager[Executor | None]:
     from impact_posture.sweep import executors
+    from impact_posture.system.processes import process_pool
 
     if scheduler is not None:
         return executors.dask_cluster(scheduler)
@@ -113,7 +114,7 @@ def _executor(
         return executors.mpi_ranks()
     if slurm is not None:
         return executors.SlurmJobs(out.with_name(f"{out.name}-slurm"), executors.parse_options(slurm))
-    return executors.process_pool(workers) if workers > 1 else nullcontext()
+    return process_pool(workers) if workers > 1 else nullcontext()
 
 
 def _show(page: Page, folder: Path, axes: str | None, out: str | None, format: list[Any] | None) -> None:

@@ -29,9 +29,10 @@ from typing import Any
 import numpy as np
 
 from impact_posture.sweep.atlas import open_atlas
-from impact_posture.sweep.executors import SlurmJobs, dask_cluster, process_pool
+from impact_posture.sweep.executors import SlurmJobs, dask_cluster
 from impact_posture.sweep.sweep_file import Sweep, read_sweep
 from impact_posture.sweep.sweep_run import SweepRun, run_sweep
+from impact_posture.system.processes import process_pool
 
 KILLS = 20
 SMALL = """

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import os
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
@@ -14,26 +12,6 @@ from typing import Any
 
 from impact_posture.errors import InputError
 from impact_posture.sweep.atlas import check_package
-from impact_posture.system.processes import depend, signals_held
-
-
-@contextmanager
-def process_pool(workers: int) -> Iterator[Executor]:
-    """Yield a pool of processes on this machine.  The processes end at the end of the ``with`` block."""
-    # Fork the workers.  Spawned workers would import all modules again, and would leave semaphores behind after a
-    # signal.
-    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("fork"), depend, (os.getpid(),))
-    others = set(multiprocessing.active_children())
-    try:
-        # The first submit forks all workers, before the pool starts a thread.  The workers inherit blocked signals,
-        # because the terminal sends Ctrl-C to every process and only the main process should react.
-        with signals_held():
-            pool.submit(os.getpid)
-        yield pool
-    finally:
-        for child in set(multiprocessing.active_children()) - others:
-            child.kill()
-        pool.shutdown(wait=False, cancel_futures=True)
 
 
 @contextmanager

@@ -8,7 +8,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager, suppress
 from multiprocessing.process import BaseProcess
 from typing import Any, NoReturn, TypeVar, cast
@@ -97,6 +97,25 @@ def _worker(index: int) -> tuple[int, Any]:
 
 
 @contextmanager
+def process_pool(workers: int) -> Iterator[Executor]:
+    """Yield a pool of forked processes, which end at the end of the ``with`` block."""
+    # Fork the workers.  Spawned workers would import all modules again, and would leave semaphores behind after a
+    # signal.
+    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("fork"), depend, (os.getpid(),))
+    others = set(multiprocessing.active_children())
+    try:
+        # The first submit forks all workers, before the pool starts a thread.  The workers inherit blocked signals,
+        # because the terminal sends Ctrl-C to every process and only the main process should react.
+        with signals_held():
+            pool.submit(os.getpid)
+        yield pool
+    finally:
+        for child in set(multiprocessing.active_children()) - others:
+            child.kill()
+        pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
 def fork_map(function: Callable[[int], _Result], count: int, jobs: int) -> Iterator[Iterator[tuple[int, _Result]]]:
     """Yield ``(index, function(index))`` for each index below ``count``, in the order in which the calls finish.
 
@@ -111,18 +130,10 @@ def fork_map(function: Callable[[int], _Result], count: int, jobs: int) -> Itera
         yield ((index, function(index)) for index in range(count))
         return
     _WORK["function"] = function
-    others = set(multiprocessing.active_children())
-    pool = ProcessPoolExecutor(min(jobs, count), multiprocessing.get_context("fork"), depend, (os.getpid(),))
     try:
-        # Delay signals while the workers are forked.  A signal reaches every process of the terminal, but workers
-        # must ignore signals from their start.
-        with signals_held():
-            futures = [pool.submit(_worker, index) for index in range(count)]
-        yield _finished(futures)
+        with process_pool(min(jobs, count)) as pool:
+            yield _finished([pool.submit(_worker, index) for index in range(count)])
     finally:
-        for child in set(multiprocessing.active_children()) - others:
-            child.kill()
-        pool.shutdown(cancel_futures=True)
         _WORK.clear()
 
 
