@@ -32,7 +32,7 @@ Processes = Annotated[int, option("--jobs", RUN, "Number of processes that run a
 
 def rows_table(page: Page, rows: tuple[ControllerRow, ...] | list[ControllerRow]) -> None:
     """Write a table with one row per controller of a scenario."""
-    from impact_posture.experiment.jobs import jsonable
+    from impact_posture.config.json_block import jsonable
     from impact_posture.experiment.reproduction_summary import interval_text, percent
     from impact_posture.experiment.seed_statistics import headline
 

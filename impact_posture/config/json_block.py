@@ -1,10 +1,11 @@
-"""Dataclasses that are blocks of a JSON document."""
+"""JSON content of Python values, and dataclasses that are blocks of a JSON document."""
 
 from __future__ import annotations
 
-from dataclasses import fields
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
 from math import isfinite
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar
 
 
 class JsonBlock:
@@ -17,18 +18,24 @@ class JsonBlock:
     derived: ClassVar[tuple[str, ...]] = ()
 
     def to_dict(self) -> dict[str, Any]:
-        """Return JSON content: arrays as lists, ``None`` for a number that is not finite, and nested blocks."""
-        names = [field.name for field in fields(cast("Any", self))]
-        return {name: _json(getattr(self, name)) for name in (*names, *self.derived)}
+        """Return JSON content, as in :func:`jsonable`."""
+        return _fields(self) | {name: jsonable(getattr(self, name)) for name in self.derived}
 
 
-def _json(entry: Any) -> Any:
-    if isinstance(entry, tuple | list):
-        return [_json(part) for part in entry]
-    if isinstance(entry, dict):
-        return {key: _json(value) for key, value in entry.items()}
-    if hasattr(entry, "to_dict"):
-        return entry.to_dict()
-    if hasattr(entry, "tolist"):
-        return _json(entry.tolist())
-    return None if isinstance(entry, float) and not isfinite(entry) else entry
+def jsonable(content: Any) -> Any:
+    """Convert content to JSON: dataclasses to objects, arrays to lists, and non-finite numbers to ``None``."""
+    if hasattr(content, "to_dict"):
+        return content.to_dict()
+    if is_dataclass(content):
+        return _fields(content)
+    if isinstance(content, Mapping):
+        return {key: jsonable(value) for key, value in content.items()}
+    if isinstance(content, tuple | list):
+        return [jsonable(part) for part in content]
+    if hasattr(content, "tolist"):
+        return jsonable(content.tolist())
+    return None if isinstance(content, float) and not isfinite(content) else content
+
+
+def _fields(value: Any) -> dict[str, Any]:
+    return {field.name: jsonable(getattr(value, field.name)) for field in fields(value)}

@@ -7,8 +7,8 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from pydantic_core import to_jsonable_python
 
+from impact_posture.config.json_block import jsonable
 from impact_posture.dynamics.mjcf import import_mujoco
 from impact_posture.errors import InputError
 from impact_posture.impact.evaluation.impact_effect import mean_load
@@ -163,11 +163,6 @@ def lost_control(job: Job, error: Exception) -> Document:
     return {"schema": SCHEMA, "scenario": job.scenario, "controller": job.controller, "mode": job.mode,
             "free": job.free, "seed": job.seed, "status": "control lost", "events": [event], "metrics": None,
             "prediction": None, "windows": [], "runs": []}  # fmt: skip
-
-
-def jsonable(content: object) -> Any:
-    """Convert content to JSON: dataclasses to objects, arrays to lists, and non-finite numbers to ``None``."""
-    return to_jsonable_python(content, inf_nan_mode="null", fallback=lambda array: array.tolist())
 
 
 def combined(metrics: list[Metrics]) -> Metrics:

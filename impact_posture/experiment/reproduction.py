@@ -6,8 +6,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from impact_posture.config.json_block import jsonable
 from impact_posture.experiment.job_store import JobStore, Progress, run_batch
-from impact_posture.experiment.jobs import Document, Job, jsonable, parse_controller, software, worth_compiling
+from impact_posture.experiment.jobs import Document, Job, parse_controller, software, worth_compiling
 from impact_posture.experiment.seed_statistics import ControllerRow, Interval, row_of
 from impact_posture.posture.program.compiled_solver import CompileMode
 from impact_posture.simulation.controllers.controller_factory import CONTROLLERS

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pinocchio as pin
 
 from impact_posture.config.checked import checked
 from impact_posture.config.demand import Factors, Positive
+from impact_posture.config.json_block import jsonable
 from impact_posture.errors import InputError
 from impact_posture.robot.joint_model import with_joint_model
 from impact_posture.robot.robot import Robot
@@ -42,7 +43,7 @@ class ModelVariant:
         return {
             "name": self.name,
             "armature_factor": self.armature_factor,
-            "payload": None if self.payload is None else asdict(self.payload),
+            "payload": jsonable(self.payload),
             "model_sha256": self.robot.model_sha256,
         }
 

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from impact_posture.config.json_block import jsonable
 from impact_posture.errors import InputError
-from impact_posture.experiment.jobs import Job, combined, jsonable, parse_controller
+from impact_posture.experiment.jobs import Job, combined, parse_controller
 from impact_posture.experiment.reproduction import (
     PAPER,
     RECOMMENDED,

@@ -25,9 +25,10 @@ from docs.studies.robustness.page import MARK, page, range_table
 from docs.studies.robustness.statistics import change, rank, summarize
 from docs.studies.robustness.study import Store, study
 from docs.studies.robustness.variations import RANGES, SHIPPED, VARIATIONS
+from impact_posture.config.json_block import jsonable
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import Infeasible, SimulationDiverged
-from impact_posture.experiment.jobs import Job, execute, jsonable
+from impact_posture.experiment.jobs import Job, execute
 from impact_posture.impact.impact_contact import point_on
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.simulation.controllers.controller_factory import ControllerFactory
