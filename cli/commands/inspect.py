@@ -125,13 +125,15 @@ def _joints(page: Page, summary: dict[str, Any]) -> None:
     def limits(joint: dict[str, Any]) -> str:
         if joint["lower"] is None and joint["upper"] is None:
             return "none"
+        if joint["lower"] == joint["upper"] == 0:
+            return "not stated"
         return f"{number(joint['lower'], missing='none')} … {number(joint['upper'], missing='none')}"
 
     page.gap()
     page.title(f"Joints ({len(summary['joints'])})", "SI units: rad, rad/s, N·m, kg·m²; prismatic: m, m/s, N, kg")
     rows = []
     for joint in summary["joints"]:
-        numbers = (number(joint[key], missing="none") for key in ("velocity", "effort", "armature"))
+        numbers = (number(joint[key], missing="not stated") for key in ("velocity", "effort", "armature"))
         rows.append((joint["name"], joint["type"], limits(joint), *numbers))
     page.table(("joint", "type", "limits", "velocity", "effort", "armature"), rows, right=(2, 3, 4, 5), fold=0)
 

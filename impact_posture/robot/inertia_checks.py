@@ -67,6 +67,14 @@ def massless_joints(model: pin.Model) -> tuple[str, ...]:
     return tuple(massless)
 
 
+def check_any_mass(model: pin.Model, where: str) -> None:
+    """Raise ``InertiaError`` if no joint moves any mass, as in a URDF for kinematics only."""
+    if len(massless_joints(model)) == model.njoints - 1:
+        fault = "no link that moves has a mass, so this model is for kinematics only"
+        hint = "give each moving link its <inertial> (mass, center of mass, inertia), which dynamics needs"
+        raise InertiaError(fault, where=where, hint=hint)
+
+
 def check_moved_mass(model: pin.Model, where: str) -> None:
     """Raise ``InertiaError`` if joints move no mass, because the mass matrix would be singular."""
     if not (joints := massless_joints(model)):

@@ -25,7 +25,7 @@ from impact_posture.errors import (
     listed,
 )
 from impact_posture.robot.armature import armature_warning, set_armature
-from impact_posture.robot.inertia_checks import check_mass_matrix, check_moved_mass, massless_joints
+from impact_posture.robot.inertia_checks import check_any_mass, check_mass_matrix, check_moved_mass, massless_joints
 from impact_posture.robot.model_joints import immovable_joints, joint_index, movable_joints, q_slice, v_slice
 from impact_posture.robot.named_postures import ignored_bases, named_postures
 from impact_posture.robot.robot import Robot
@@ -74,6 +74,7 @@ def build_robot(located: Located, options: LoadOptions) -> Robot:
     _check_limits(model, source)
     postures, default = named_postures(model, srdf, spec, root, name)
     armature_source = set_armature(model, spec, srdf, options.armature, name)
+    check_any_mass(model, source)
     locked = _named(model, (*spec.model.lock, *options.lock), f"{name} lock")
     if spec.model.lock_massless or options.lock_massless:
         massless = (joint for joint in massless_joints(model) if joint != "root_joint")
@@ -232,7 +233,8 @@ def _immovable(model: pin.Model) -> list[str]:
     if not (joints := immovable_joints(model)):
         return []
     held = f"joints with equal position limits are held at them: {listed(joints)}"
-    return [f"{held}; `lock` them if an impact cannot move them, or state limits in robot.toml [limits.position]"]
+    state = "state limits in robot.toml [limits.position] (0 … 0 also means that the URDF states none)"
+    return [f"{held}; `lock` them if an impact cannot move them, or {state}"]
 
 
 def _named(model: pin.Model, patterns: Sequence[str], where: str) -> tuple[str, ...]:

@@ -18,7 +18,7 @@ import pinocchio as pin
 
 from impact_posture.errors import PackageNotFound, SpecError, UrdfError, nearest
 from impact_posture.robot.inertia_checks import check_inertias
-from impact_posture.robot.urdf_joints import correct_joints
+from impact_posture.robot.urdf_joints import clear_negative_limits, correct_joints
 
 # pin.Data always contains 6 nv³ numbers: 0.4 GB at 200 degrees of freedom, and 48 GB at 1,000.
 MOST_DEGREES_OF_FREEDOM = 200
@@ -95,10 +95,12 @@ def build_model(
     """
     root = parse_urdf(path)
     _check_depth(root, path)
+    below_zero = clear_negative_limits(root)
     try:
         with quiet_stderr() as errors:
             # The decoded text instead of the file, because urdfdom reads each file as UTF-8.
-            model = pin.buildModelFromXML(_xml_text(path), *([pin.JointModelFreeFlyer()] if free_flyer else []))
+            text = ET.tostring(root, encoding="unicode") if below_zero else _xml_text(path)
+            model = pin.buildModelFromXML(text, *([pin.JointModelFreeFlyer()] if free_flyer else []))
     except Exception as error:  # The type of exception differs between versions of Pinocchio.
         fault = f"makes no robot ({errors[0] or error})"
         raise UrdfError(fault, where=str(path), hint="correct the URDF") from None
@@ -113,8 +115,8 @@ def build_model(
         fault = f"has {model.nv} degrees of freedom, more than the supported {MOST_DEGREES_OF_FREEDOM}"
         raise UrdfError(fault, where=str(path), hint="in the URDF, fix the joints that hardly matter")
     mimics, lost = _mimics(root)
-    warnings = (*check_inertias(root, model, path, accept_inertias), *correct_joints(root, model, path), *lost)
-    return model, warnings, mimics
+    checked = (*check_inertias(root, model, path, accept_inertias), *correct_joints(root, model, path))
+    return model, (*checked, *lost, *below_zero), mimics
 
 
 def _check_depth(root: ET.Element, path: Path) -> None:

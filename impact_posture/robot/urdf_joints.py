@@ -9,13 +9,31 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.errors import UrdfError
+from impact_posture.errors import UrdfError, listed
 from impact_posture.system.arrays import Array
 
 # Types of joints that have an axis.
 _WITH_AXIS = ("revolute", "continuous", "prismatic", "planar")
 # A continuous joint whose stated range (rad) is shorter than a turn by more than this should be revolute.
 _SHORT_OF_A_TURN = 0.01
+
+
+def clear_negative_limits(root: ET.Element) -> tuple[str, ...]:
+    """Set negative limits of effort and velocity, which Pinocchio rejects, to 0 (not known); return warnings."""
+    warnings = []
+    for key in ("effort", "velocity"):
+        negative = [
+            (limit, f"{joint.get('name')} ({limit.get(key)})")
+            for joint in root.findall("joint")
+            for limit in joint.findall("limit")
+            if (limit.get(key) or "").lstrip().startswith("-") and limit.get(key, "").strip("-0. ")
+        ]
+        for limit, _ in negative:
+            limit.set(key, "0")
+        if negative:
+            fault = f"negative {key} limits are read as not known: {listed([text for _, text in negative])}"
+            warnings.append(f"{fault}; state them in robot.toml [limits.{key}]")
+    return tuple(warnings)
 
 
 def correct_joints(root: ET.Element, model: pin.Model, path: Path) -> tuple[str, ...]:

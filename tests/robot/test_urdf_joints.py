@@ -12,7 +12,10 @@ from impact_posture.errors import UrdfError
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.impact.quantities.impact_oracle import ImpactOracle
+from impact_posture.robot.actuation import torque_limits
 from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_summary import summarize
+from tests.support.command import run
 from tests.support.helpers import assert_close
 from tests.support.urdfs import joint, link, load
 
@@ -86,3 +89,30 @@ def test_a_type_that_urdf_lacks_is_refused_by_the_name_of_its_joint(tmp_path: Pa
     for kind in ("Revolute", "ball", "screw"):
         with pytest.raises(UrdfError, match=rf"Joint \[b\] has no known type \[{kind}\]"):
             load(tmp_path, *ARM, joint("b", "stand cart", kind=kind))
+
+
+def test_negative_limits_of_effort_and_velocity_are_not_known(tmp_path: Path) -> None:
+    unlimited = '<limit lower="-2.5" upper="2.5" effort="-1" velocity="-1.0"/>'
+    tree = (link("s", 5), link("u", 2, "0.2 0 0"), link("f", 1, "0.2 0 0"), joint("b", "u f"))
+    robot = load(tmp_path, *tree, joint("a", "s u", more=unlimited))
+    efforts = "negative effort limits are read as not known: a (-1); state them in robot.toml [limits.effort]"
+    assert efforts in robot.warnings and any(
+        "velocity limits" in line and "a (-1.0)" in line for line in robot.warnings
+    )
+    assert torque_limits(robot.model).tolist() == [np.inf, 100] and robot.velocity_limits.tolist() == [np.inf, 5]
+    assert [entry["effort"] for entry in summarize(robot)["joints"]] == [None, 100]
+    stated = load(tmp_path, *tree, joint("a", "s u", more=unlimited), toml="[limits.effort]\na = 50")
+    assert torque_limits(stated.model).tolist() == [50, 100]
+
+
+def test_position_limits_that_are_not_stated(tmp_path: Path) -> None:
+    tree = (link("s", 5), link("u", 2, "0.2 0 0"), link("f", 1, "0.2 0 0"), joint("b", "u f"))
+    bare = joint("a", "s u", more='<limit effort="10" velocity="1"/>')
+    line = "joints with equal position limits are held at them: a"
+    assert any(line in warning for warning in load(tmp_path, *tree, bare).warnings)
+    done = run("inspect", tmp_path / "written.urdf")
+    assert next(row for row in done.stdout.splitlines() if row.startswith("a ")).split() == (
+        ["a", "revolute", "not", "stated", "1", "10", "0"]
+    )
+    stated = load(tmp_path, *tree, bare, toml="[limits.position]\na = [-1, 1]")
+    assert not any(line in warning for warning in stated.warnings)
