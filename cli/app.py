@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+from impact_posture_cli.argv import split_vectors
 from impact_posture_cli.commands import COMMANDS
 
 
@@ -33,7 +34,9 @@ class CommandGroup(TyperGroup):
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Return the name, the parser and the arguments of the called subcommand."""
         name, _, rest = super().resolve_command(ctx, args)
-        return name, build(str(name)), rest
+        command = build(str(name))
+        lengths = {option: p.nargs for p in command.params if p.nargs > 1 for option in p.opts}
+        return name, command, split_vectors(rest, lengths)
 
 
 app = typer.Typer(

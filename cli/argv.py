@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import zip_longest
 
 # Options whose value may be omitted.  The next argument is the value if it matches the pattern.
@@ -35,3 +35,22 @@ def put_right(arguments: Sequence[str]) -> list[str]:
 
             filled.append(str(TRADEOFF_POINTS) if word == "--tradeoff" else "")
     return filled
+
+
+def split_vectors(arguments: Sequence[str], lengths: Mapping[str, int]) -> list[str]:
+    """Return the arguments with each vector as separate words: ``0,0,1`` or ``[0, 0, 1]`` becomes ``0 0 1``.
+
+    ``lengths`` maps the options that take several numbers to the count of their numbers.
+    """
+    words, left = list[str](), 0
+    for word in arguments:
+        option, equals, value = word.partition("=")
+        if option in lengths:
+            words.append(option)
+            left, word = lengths[option], value
+            if not equals:
+                continue
+        parts = re.split(r"[,\s]+", word.strip("[]() ,")) if left > 0 else [word]
+        words += parts
+        left -= len(parts)
+    return words

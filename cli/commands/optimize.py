@@ -108,7 +108,7 @@ def optimize(
 
 
 def _settings(robot: str, typed: TypedSettings) -> ProblemSettings:
-    from_file = robot.endswith(".toml")
+    from_file = robot.endswith((".toml", ".yaml", ".yml"))  # YAML gets an error that names TOML.
     if not from_file and os.path.isfile(problem := Path(robot) / "problem.toml"):
         from impact_posture.robot.robot_loader import known_robots
 

@@ -16,6 +16,10 @@ from impact_posture.system.text_files import read_text
 _Table = TypeVar("_Table")
 
 
+# A line of YAML that cannot begin a line of TOML outside of a text: ``key: value`` or ``- item``.
+_YAML_LINE = re.compile(r"^ *(?:- )?[\w-]+:(?: |$)|^ *- ", re.MULTILINE)
+
+
 class StrictTable:
     """Base of dataclasses that reject unknown keys, numbers in quotes, and ``true`` in place of 1 in a file."""
 
@@ -54,10 +58,14 @@ def validate(cls: type[_Table], data: object, where: str) -> _Table:
     if fault["type"] in _UNKNOWN:
         close = ", ".join(nearest(str(location[-1]), _keys_at(cls, location[:-1])))
         what, hint = f"unknown key '{shown(path)}'", f"did you mean {close}?"
+    elif fault["type"] == "missing":
+        what, hint = f"key '{path}' is missing", "add it"
     elif fault["type"] == "value_error":  # from a Demand
         what, hint = f"key '{path}' is {shown(fault['input'])}", str(fault["ctx"]["error"])
     elif fault["type"] == "literal_error":
-        what, hint = not_one_of(fault["input"], re.findall(r"'([^']*)'", fault["ctx"]["expected"]))
+        # Pydantic writes "'a', 'b' or 3".
+        choices = re.findall(r"'([^']*)'|(-?\d+)", fault["ctx"]["expected"])
+        what, hint = not_one_of(fault["input"], [text or number for text, number in choices])
         what = f"key '{path}': {what}"
     raise SpecError(what, where=where, hint=hint)
 
@@ -92,11 +100,15 @@ def read_toml(path: Path) -> dict[str, object]:
     Raises:
         SpecError: The file is absent, cannot be read, or is not valid TOML.
     """
+    text = ""
     try:
-        return tomllib.loads(read_text(path))
+        text = read_text(path)
+        return tomllib.loads(text)
     except (OSError, UnicodeDecodeError) as error:
         raise SpecError.unreadable(path, error) from None
     except RecursionError:
         raise SpecError("is nested too deeply", where=str(path), hint="correct the syntax") from None
     except ValueError as error:  # TOMLDecodeError, or a number has more digits than Python converts.
-        raise SpecError(f"is not valid TOML ({error})", where=str(path), hint="correct the syntax") from None
+        other = "JSON" if text.lstrip().startswith("{") else "YAML" if _YAML_LINE.search(text) else ""
+        hint = f"this looks like {other}: in TOML write [table], then key = value" if other else "correct the syntax"
+        raise SpecError(f"is not valid TOML ({error})", where=str(path), hint=hint) from None

@@ -10,9 +10,11 @@ import pytest
 
 from impact_posture.collision.robot_shapes import shape_warnings
 from impact_posture.config.problem_settings import LoadOptions
+from impact_posture.config.table_validation import validate
 from impact_posture.errors import ImpactPostureError, InertiaError, SpecError, UrdfError
 from impact_posture.robot.draft import write_draft
 from impact_posture.robot.robot_loader import load_robot
+from impact_posture.robot.robot_spec import RotorSpec
 
 GOOD = '<mass value="1"/><inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/>'
 OFF_AXIS = '<origin xyz="0.1 0.2 0.3"/>' + GOOD
@@ -263,9 +265,21 @@ def test_a_joint_that_moves_no_mass(load: Load) -> None:
 
 
 def test_a_chain_of_massless_links_is_named_whole(load: Load) -> None:
-    elements = [link("a", GOOD), link("b", None), link("c", None), joint("a", "b"), joint("b", "c", "1 0 0")]
-    with pytest.raises(InertiaError, match="2 joints move no mass: 'a_b', 'b_c'"):
+    chain = [("a", "b"), ("b", "c"), ("c", "d")]
+    elements = [link("a", None), link("b", OFF_AXIS), link("c", None), link("d", None), *(joint(*e) for e in chain)]
+    with pytest.raises(InertiaError, match="2 joints move no mass: 'b_c', 'c_d'"):
         load(*elements)
+
+
+def test_a_urdf_for_kinematics_only(load: Load, tmp_path: Path) -> None:
+    elements = (link("a", GOOD), link("b", None), link("c", None), joint("a", "b"), joint("b", "c", "1 0 0"))
+    for options in ({}, {"lock_massless": True}):
+        with pytest.raises(InertiaError) as caught:
+            load(*elements, **options)
+        one_line(caught.value, "no link that moves has a mass", "kinematics only", "<inertial>")
+        assert "lock" not in caught.value.line
+    with pytest.raises(InertiaError, match="kinematics only"):
+        write_draft(str(tmp_path / "bad.urdf"), LoadOptions(), tmp_path / "draft.toml")
 
 
 def test_a_floating_joint_in_the_urdf(load: Load) -> None:
@@ -333,11 +347,14 @@ PLAIN = (link("a", None), link("b", OFF_AXIS), joint("a", "b"))
         ("[[supports]]\nframe = 'b'\nkid = 'point'", ("unknown key 'supports.0.kid'", "kind")),
         ("[postures.up]\njonts = {}", ("unknown key 'postures.up.jonts'", "joints")),
         ("[[supports]]\nframe = 'b'\nkind = 'line'", ("supports.0.kind", "'line' is not one of point, surface")),
+        ("[[supports]]\nkind = 'point'", ("key 'supports.0.frame' is missing; add it",)),
         ("[model]\nroot = 'floating'", ("model.root", "free-flyer")),
         ("[limits.velocity]\na_b = 0.0", ("limits.velocity.a_b", "above zero")),
         ('schema = "impact-posture/robot/2"\nnew = 1', ("schema 'impact-posture/robot/2'", "impact-posture/robot/1")),
         ("schema = 1", ("schema '1'",)),
-        ("a = ", ("is not valid TOML", "config.toml")),
+        ("a = ", ("is not valid TOML", "config.toml", "correct the syntax")),
+        ("model:\n  root: free-flyer", ("is not valid TOML", "looks like YAML: in TOML write [table], then key = ")),
+        ('{"model": {}}', ("is not valid TOML", "looks like JSON")),
         ('default_posture = "up"', ("default_posture 'up' does not exist", "neutral")),
         ("[limits.position]\na_b = [1.0, -1.0]", ("a_b", "lower < upper")),
         ("[postures.up]\nbase = [0, 0, 0, 0, 0, 0, 1]", ("base pose", "root is fixed")),
@@ -350,6 +367,13 @@ def test_bad_robot_toml(load: Load, toml: str, words: tuple[str, ...]) -> None:
     with pytest.raises(SpecError) as caught:
         load(*PLAIN, toml=toml)
     one_line(caught.value, *words)
+
+
+def test_choices_of_numbers_are_listed() -> None:
+    rotor = {"name": "r", "position": [0, 0, 0], "direction": [0, 0, 1], "spin": "ccw"}
+    with pytest.raises(SpecError) as caught:
+        validate(RotorSpec, rotor, "robot.toml")
+    one_line(caught.value, "key 'spin': 'ccw' is not one of -1, 1; choose one of them")
 
 
 def test_missing_config(load: Load) -> None:
