@@ -6,9 +6,10 @@ The command line prints ``what``, ``where`` and ``hint`` as one line and exits w
 from __future__ import annotations
 
 import difflib
+import math
 import reprlib
 import unicodedata
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import ClassVar, Self
 
@@ -210,15 +211,23 @@ class PostureError(InputError):
 
 
 class NotWithinLimits(PostureError):
-    """A joint is outside its position limits."""
+    """A joint is outside its position limits; ``angle`` says whether ``value`` is an angle."""
 
-    def __init__(self, joint: str, value: float, lower: float, upper: float, *, where: str = "posture") -> None:
+    def __init__(
+        self, joint: str, value: float, lower: float, upper: float, *, where: str = "posture", angle: bool = False
+    ) -> None:
         self.joint, self.value, self.lower, self.upper = joint, value, lower, upper
+        hint = "choose a posture within the limits or correct them in robot.toml [limits.position]"
         super().__init__(
             f"joint '{joint}' is at {value:.6g}, outside its limits [{lower:.6g}, {upper:.6g}]",
             where=where,
-            hint="choose a posture within the limits or correct them in robot.toml [limits.position]",
+            hint=degrees_hint(value) if angle and abs(value) > 2 * math.pi else hint,
         )
+
+
+def degrees_hint(value: float) -> str:
+    """Return the hint for an angle that is probably in degrees."""
+    return f"degrees? Angles are in radians: {value:g}° are {math.radians(value):.6g}"
 
 
 class ContactError(InputError):
@@ -272,14 +281,25 @@ _MOST_NAMED = 6
 
 
 class Infeasible(ImpactPostureError):
-    """No posture satisfies the constraints; the error contains the conflicting constraints."""
+    """No posture satisfies the constraints; the error contains the conflicting constraints.
+
+    Args:
+        conflicts: Name of each violated constraint and its violation.
+        sizes: Violations as texts with units, by name.
+        where: Source of the constraints.
+        hint: How the user can correct the error.
+    """
 
     exit_code = 3
 
-    def __init__(self, conflicts: dict[str, float], *, where: str = "problem", hint: str = "") -> None:
+    def __init__(
+        self, conflicts: dict[str, float], sizes: Mapping[str, str] | None = None, *, where: str = "problem",
+        hint: str = "",
+    ) -> None:  # fmt: skip
         self.conflicts = dict(conflicts)
+        texts = {name: f"off by {value:.3g}" for name, value in conflicts.items()} | dict(sizes or {})
         worst = sorted(self.conflicts.items(), key=lambda conflict: -conflict[1])
-        named = listed([f"{name} (off by {value:.3g})" for name, value in worst], _MOST_NAMED)
+        named = listed([f"{name} ({texts[name]})" for name, _ in worst], _MOST_NAMED)
         super().__init__(
             f"the constraints conflict: {named}",
             where=where,

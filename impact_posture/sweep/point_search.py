@@ -118,7 +118,7 @@ def search(walk: Walk, place: Place, guesses: Sequence[Start], beside: float = 0
         # The result of the relaxed problem is either a set of conflicting constraints, or a start posture.
         relaxed = walk.relax(place, [guess.q for guess in guesses], beside)
         if relaxed.conflicts:
-            return attempt.failure("infeasible", Infeasible(relaxed.conflicts).what, relaxed.violation)
+            return attempt.failure("infeasible", Infeasible(relaxed.conflicts, relaxed.sizes).what, relaxed.violation)
         result = attempt.certified([Start(relaxed.q)]) or attempt.searched(relaxed.q)
         return result or attempt.failure("uncertified", attempt.fault)
     except ImpactPostureError as error:

@@ -28,6 +28,7 @@ class ApproachSpeed(Constraint):
     """
 
     price = _PRICE
+    unit = "m/s"
     # Initial postures are not projected onto this constraint, so that they remain diverse.
     projected = False
 

@@ -19,6 +19,8 @@ class CenterOfMassOverFeet(ExpressionConstraint):
     are ``b``.  If ``loaded`` is given (a model and its name), the center of mass of this model is used.
     """
 
+    unit = "m"
+
     def __init__(
         self, normals: Array, offsets: Array, margin: float, loaded: tuple[pin.Model, str] | None = None
     ) -> None:

@@ -49,6 +49,7 @@ class Clearance(Constraint):
     projected = False
     grows = True
     by_row = True
+    unit = "m"
 
     def __init__(
         self,

@@ -118,6 +118,7 @@ class Constraint(ABC):
         by_row: Whether a conflict is reported for each row instead of for the whole constraint.
         price: Weight per unit of violation in the search for conflicts.  If constraints conflict, the constraint with
             the lowest weight is violated and therefore reported.
+        unit: Unit of a violation in messages.
     """
 
     name: str
@@ -128,6 +129,7 @@ class Constraint(ABC):
     grows: bool = False
     by_row: bool = False
     price: float = 1.0
+    unit: str = ""
 
     @property
     def rows(self) -> int:
@@ -199,6 +201,10 @@ class Constraint(ABC):
         if self.by_row:
             return {self.row_name(row): abs(float(excess[row])) for row in np.flatnonzero(excess).tolist()}
         return {self.name: float(np.linalg.norm(excess))}
+
+    def size(self, name: str, violation: float) -> str:
+        """Return the size of a violation as text; ``name`` and ``violation`` are from :meth:`conflicts`."""
+        return f"off by {violation:.3g} {self.unit}".rstrip()
 
     def describe(self) -> str:
         """Describe the constraint in one line."""

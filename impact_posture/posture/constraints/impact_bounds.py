@@ -47,6 +47,8 @@ class ImpactBounds(Constraint):
             no bound.
     """
 
+    by_row = True
+
     def __init__(self, objective: WorstCaseObjective, largest_mass: float, jump: float, variant: str = "") -> None:
         where = f" ({variant})" if variant else ""
         self.name = f"bounds on the impact{where}"
@@ -60,7 +62,8 @@ class ImpactBounds(Constraint):
         mass, count = [largest_mass] * bool(np.isfinite(largest_mass)), len(self._joints)
         self._names = [f"peak force{where}"] * len(mass)
         self._names += [f"jump of {robot.tangent_names[int(k)]}{where}" for k in self._joints]
-        self._units = ["in kg of effective mass"] * len(mass) + ["in rad/s (m/s) per m/s of approach"] * count
+        units = ["kg of effective mass"] * len(mass) + ["rad/s (m/s) per m/s of approach"] * count
+        self._units = dict(zip(self._names, units, strict=True))
         self.lower = np.array([*[-np.inf] * len(mass), *[-jump] * count])
         self.upper = np.array([*mass, *[jump] * count])
         # Covector c and share s of each row, whose value is cᵀΔν + s m.
@@ -133,9 +136,8 @@ class ImpactBounds(Constraint):
         auxiliary = np.zeros((len(values), len(auxiliaries)))
         return Linearization(self._names * len(sides), values, lower, upper, slopes, auxiliary)
 
-    def conflicts(self, excess: Array) -> dict[str, float]:
-        rows = zip(self._names, self._units, excess.tolist(), strict=True)
-        return {f"{self.name}: {name}, {unit}": abs(value) for name, unit, value in rows if value}
+    def size(self, name: str, violation: float) -> str:
+        return f"{super().size(name, violation)} {self._units[name]}"
 
     def row_name(self, row: int) -> str:
         return self._names[row]

@@ -19,6 +19,8 @@ class NestedLinks(ExpressionConstraint):
     Each joint coordinate is divided by half of the joint range, so violations are relative to this half range.
     """
 
+    unit = "of half the joint range"
+
     def __init__(self, robot: Robot, planes: JointPlanes) -> None:
         joints = [robot.joint_id(name) for name in planes.joints]
         self._planes = planes

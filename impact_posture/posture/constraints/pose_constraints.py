@@ -18,6 +18,8 @@ from impact_posture.system.arrays import Array
 class HeldPosition(ExpressionConstraint):
     """The point stays at ``p*``: ``p(q) − p* = 0``, world axes, meters."""
 
+    unit = "m"
+
     def __init__(self, name: str, point: PointOnLink, target: Array) -> None:
         self.name, self.point = name, point
         self.parameters = np.array(target, dtype=float)
@@ -62,6 +64,8 @@ class HeldOrientation(ExpressionConstraint):
     ``None``, ``Q_right`` is the identity, and all three components are rows.
     """
 
+    unit = "rad"
+
     def __init__(self, name: str, point: PointOnLink, target: Array, axis: Array | None = None) -> None:
         self.name, self.point, target = name, point, np.array(target, dtype=float)
         self.axis = axis
@@ -105,6 +109,8 @@ class HeldOrientation(ExpressionConstraint):
 class HeldPose(ExpressionConstraint):
     """The frame keeps its position and orientation (six rows), or may spin about ``axis`` (five rows)."""
 
+    unit = "in m and rad"
+
     def __init__(self, name: str, point: PointOnLink, target: pin.SE3, axis: Array | None = None) -> None:
         self.name = name
         self._parts = (
@@ -142,6 +148,8 @@ class AxisInCone(ExpressionConstraint):
     world, shape (3,).  ``degrees`` is the half angle α of the cone.  ``point`` is a point on the link of the frame.
     """
 
+    unit = "in the cosine"
+
     def __init__(self, name: str, point: PointOnLink, axis: Array, direction: Array, degrees: float) -> None:
         self.name, self.point, self._degrees = name, point, degrees
         self.parameters = np.concatenate([axis, direction])
@@ -165,6 +173,8 @@ class HeldTurn(ExpressionConstraint):
     ``point`` is the origin of the base, ``target`` the orientation ``Q*`` of the base before a turn, shape (3, 3),
     and ``axis`` a unit vector in base axes, shape (3,).
     """
+
+    unit = "rad"
 
     def __init__(self, point: PointOnLink, target: Array, axis: Array, name: str) -> None:
         self.name = name

@@ -68,6 +68,8 @@ class WithinDistance(ExpressionConstraint):
     The radius (> 0) is a row bound and the reference is a parameter, so one program serves all radii and references.
     """
 
+    unit = "in the square of rad and m"
+
     def __init__(self, chart: Chart, reference: Array, radius: float) -> None:
         self.name = "distance from the initial posture"
         self._chart = chart

@@ -10,6 +10,7 @@ import pinocchio as pin
 
 from impact_posture.posture.loads.static_load import ForceSource, StaticLoad
 from impact_posture.posture.program.linear_program import solve_linear
+from impact_posture.robot.model_joints import effort_unit
 from impact_posture.system.arrays import Array
 
 # Shares (:class:`Equilibrium`) are treated as equal to the largest share if they differ from it by less than this.
@@ -98,6 +99,8 @@ class Equilibrium:
         free = [self.load.names[k] for k in self._free]
         self.kinds = ("thrust",) * len(half) + ("torque",) * len(bounded) + ("thrust",) * len(free)
         self.actuators = (*thrusts.names, *(names[k] for k in bounded), *free)
+        units = [effort_unit(model, joint) for joint in range(1, model.njoints) for _ in range(model.nvs[joint])]
+        self.units = (*["N"] * len(half), *(units[k] for k in bounded), *["N"] * len(free))
         ends = [
             (np.append(thrusts.lower, -limits[bounded]), np.append(thrusts.upper, limits[bounded])),
             (weight * self.load.lower[self._free], weight * self.load.upper[self._free]),

@@ -68,6 +68,15 @@ class Holdable(Constraint):
     def row_name(self, row: int) -> str:
         return self._names[row - 1] if row else self._balance
 
+    def size(self, name: str, violation: float) -> str:
+        if name == self._balance:
+            return f"off by {violation:.3g} of the weight"
+        k = self._names.index(name)
+        low, high, unit = self._rest.lower[k], self._rest.upper[k], self._rest.units[k]
+        if low == -high:
+            return f"needs {high * (1 + violation):.4g} {unit}, limit {high:.4g} {unit}"
+        return f"{(high - low) / 2 * violation:.3g} {unit} outside {low:.4g} to {high:.4g} {unit}"
+
     def evaluate(self, model: Numeric) -> tuple[Array, Array]:
         forces = self._rest.distribute(model.q)
         # If the base is not balanced, the shares are not known, so their rows are reported as satisfied.
@@ -143,6 +152,7 @@ class ReachableWrench(ExpressionConstraint):
     """
 
     price = _PRICE
+    unit = "of the weight"
 
     def __init__(self, name: str, load: StaticLoad, rows: Array) -> None:
         self.name, self._load = f"force on the base beyond the rotors {name}", load

@@ -27,6 +27,7 @@ class ActuatorLoad(JsonBlock):
     low: float
     high: float
     share: float
+    unit: str
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,11 @@ class HoldingForces(JsonBlock):
         if len(unreachable):
             unbalanced += float(np.abs(unreachable @ rest.load.torque(q, z).value[:6] / rest.weight).sum())
         values = (rest.upper + rest.lower) / 2 + (rest.upper - rest.lower) / 2 * shares
-        loads = np.array([values, rest.lower, rest.upper, np.abs(shares)]).T.tolist()
+        numbers = np.array([values, rest.lower, rest.upper, np.abs(shares)]).T.tolist()
+        loads = [
+            ActuatorLoad(value, low, high, share, unit)
+            for (value, low, high, share), unit in zip(numbers, rest.units, strict=True)
+        ]
         forces: dict[str, Array] = {}
         for source, part in zip(rest.load.sources, rest.load.split(z), strict=True):
             if part.size and not source.in_frame:
@@ -74,7 +79,7 @@ class HoldingForces(JsonBlock):
             feasible=unbalanced <= _ROUNDING and distribution.largest <= 1 + _ROUNDING,
             largest_share=distribution.largest,
             unbalanced=unbalanced,
-            actuators={name: ActuatorLoad(*numbers) for name, numbers in zip(rest.actuators, loads, strict=True)},
+            actuators=dict(zip(rest.actuators, loads, strict=True)),
             contact_forces={foot: force.tolist() for foot, force in forces.items()},
         )
 
@@ -87,6 +92,6 @@ class HoldingForces(JsonBlock):
             )
         for name, load in sorted(self.actuators.items(), key=lambda item: -item[1].share):
             if load.share > 1 + _ROUNDING and self.unbalanced <= _ROUNDING:
-                limits = f"[{load.low:.3g}, {load.high:.3g}]"
-                lines.append(f"{self.load}, {name} would need {load.value:.3g}, outside {limits}")
+                limits = f"{load.low:.3g} to {load.high:.3g} {load.unit}"
+                lines.append(f"{self.load}, {name} would need {load.value:.3g} {load.unit}, outside {limits}")
         return lines + [line for other in self.other_loads for line in other.violations()]

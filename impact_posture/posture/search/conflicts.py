@@ -43,6 +43,7 @@ class LeastViolation:
     """The posture ``q`` with the least violation, and the problem with all parts that its program needed.
 
     ``conflicts`` is the violation of each violated constraint; it is empty if all constraints are satisfied.
+    ``sizes`` contains the violations as texts with units.
     ``at_limits`` names the joints that are at a limit.  ``violation`` is the sum of all violations, each multiplied
     by the price of its constraint.
     """
@@ -50,6 +51,7 @@ class LeastViolation:
     q: Array
     problem: ConstrainedProblem
     conflicts: dict[str, float]
+    sizes: dict[str, str]
     at_limits: tuple[str, ...]
     violation: float
 
@@ -165,12 +167,13 @@ class ElasticProgram:
 
 def _conflicts_at(problem: ConstrainedProblem, chart: Chart, q: Array) -> LeastViolation:
     numeric = Numeric(problem.robot.model).at(q)
-    conflicts: dict[str, float] = {}
+    conflicts, sizes = dict[str, float](), dict[str, str]()
     total = 0.0
     for constraint, excess in zip(problem.constraints, problem.violations(numeric), strict=True):
         for name, violation in constraint.conflicts(excess).items():
             if violation > _KEPT:
                 conflicts[name] = conflicts.get(name, 0.0) + violation
+                sizes[name] = constraint.size(name, conflicts[name])
                 total += constraint.price * violation
     x = chart.to_x(q)
     limits = []
@@ -181,4 +184,4 @@ def _conflicts_at(problem: ConstrainedProblem, chart: Chart, q: Array) -> LeastV
             limits.append(f"'{slot.name}' at its lower limit")
         elif problem.upper[slot.x] - x[slot.x] < 1e-4:
             limits.append(f"'{slot.name}' at its upper limit")
-    return LeastViolation(q, problem, conflicts, tuple(limits), total)
+    return LeastViolation(q, problem, conflicts, sizes, tuple(limits), total)

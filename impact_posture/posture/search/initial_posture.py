@@ -44,6 +44,7 @@ def initial_posture(problem: ConstrainedProblem, seed: int, rows: ProgramRows) -
         design = "; links that touch by design may touch by <disable_collisions> in an SRDF" if overlap else ""
         raise Infeasible(
             least.conflicts,
+            least.sizes,
             hint=f"{_turn_hint(problem, seed)}relax one of them, move the target, or start from another `posture`"
             f"{struck}{design}{limits}",
         )
