@@ -15,26 +15,10 @@ from impact_posture.codegen.export_functions import FUNCTIONS
 from impact_posture.codegen.export_library import named_objectives
 from impact_posture.codegen.manifest_reader import SCHEMA
 from impact_posture.codegen.self_test import self_test
-from impact_posture.dynamics.chart import Chart
 from impact_posture.impact.elasticity.contact_compression import Compression
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
-from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 from impact_posture.version import __version__
-
-
-def configuration_names(robot: Robot) -> list[str]:
-    """Return a name for each entry of ``q``, with its unit."""
-    parts = {
-        "free-flyer": ("x (m)", "y (m)", "z (m)", "qx", "qy", "qz", "qw"),
-        "spherical": ("qx", "qy", "qz", "qw"),
-        "planar": ("x (m)", "y (m)", "cos", "sin"),
-        "continuous": ("cos", "sin"),
-        "translation": ("x (m)", "y (m)", "z (m)"),
-        "prismatic": ("(m)",),
-        "revolute": ("(rad)",),
-    }
-    return [f"{slot.name} {part}" for slot in Chart(robot.model).slots for part in parts[slot.kind.family]]
 
 
 def build_manifest(
@@ -82,7 +66,7 @@ def build_manifest(
         "robot": robot.name,
         "joint_names": list(robot.joint_names),
         "convention": robot.convention,
-        "q_names": configuration_names(robot),
+        "q_names": list(robot.q_names),
         "v_names": list(robot.tangent_names),
         "nq": robot.nq,
         "nv": robot.nv,

@@ -17,7 +17,6 @@ from impact_posture.codegen.c_emitter import BlockText, Constants, Emitter
 from impact_posture.codegen.c_literals import DOUBLE, c_double
 from impact_posture.codegen.export_files import environment
 from impact_posture.codegen.expression_graph import graph_of
-from impact_posture.codegen.manifest_builder import configuration_names
 from impact_posture.codegen.sum_order import reorder_sums
 from impact_posture.config.problem_settings import Vector3
 from impact_posture.controller_export.controller_parameters import RULES, Field
@@ -168,7 +167,7 @@ def render(
     named_fields = [(field.name, k) for k, field in enumerate(fields, 1) if field.name in _NAMED]
     context: dict[str, Any] = {
         "robot": robot.name, "version": __version__, "prefix": prefix, "sizes": sizes, "room": room, "fields": fields,
-        "q_names": configuration_names(robot), "v_names": robot.tangent_names, "u_names": s.actuators.names,
+        "q_names": list(robot.q_names), "v_names": robot.tangent_names, "u_names": s.actuators.names,
         "convention": robot.convention, "tasks": [t.name for t in s.tasks] or ["none"], "metric": metric,
         "shared": fields[-1].value.size if shared else 0,
         "stack_bytes": -(-max(code.stack_bytes, solver + 16 * nv * 8) // 64) * 64 + _FRAMES,

@@ -15,7 +15,6 @@ import casadi as ca
 from impact_posture.codegen.c_names import c_identifier, check_prefix
 from impact_posture.codegen.export import WrittenCode
 from impact_posture.codegen.export import export as export_gradient
-from impact_posture.codegen.manifest_builder import configuration_names
 from impact_posture.codegen.manifest_reader import identity
 from impact_posture.config.checked import checked
 from impact_posture.controller_export.compiled_controller import CompiledController
@@ -165,7 +164,7 @@ def _manifest(s: Structure, fields: Sequence[Field], prefix: str) -> dict[str, A
         "armature": robot.armature.tolist(),
         "nq": robot.nq,
         "nv": robot.nv,
-        "q_names": configuration_names(robot),
+        "q_names": list(robot.q_names),
         "v_names": list(robot.tangent_names),
         "u_names": list(s.actuators.names),
         "sizes": s.sizes,

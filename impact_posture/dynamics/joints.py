@@ -11,14 +11,8 @@ from numpy.typing import NDArray
 
 from impact_posture.dynamics.spatial import Spin, constant, quaternion_matrix, skew, template
 from impact_posture.errors import UnsupportedJoint
+from impact_posture.robot.model_joints import JOINT_ENTRIES, joint_family
 
-# Name of a Pinocchio joint type, without "JointModel" → family of the joint.
-_FAMILIES = {
-    **dict.fromkeys(("RX", "RY", "RZ", "RevoluteUnaligned"), "revolute"),
-    **dict.fromkeys(("RUBX", "RUBY", "RUBZ", "RevoluteUnboundedUnaligned"), "continuous"),
-    **dict.fromkeys(("PX", "PY", "PZ", "PrismaticUnaligned"), "prismatic"),
-    **{"FreeFlyer": "free-flyer", "Planar": "planar", "Spherical": "spherical", "Translation": "translation"},
-}
 # Families that rotate by an angle about an axis; families whose configuration ends with a quaternion.
 _TURNING, _QUATERNION = ("revolute", "continuous", "planar"), ("free-flyer", "spherical")
 
@@ -52,11 +46,10 @@ def joint_kind(joint: pin.JointModel, name: str) -> JointKind:
     Raises:
         UnsupportedJoint: The joint type cannot occur in a URDF (composite, universal, helical, ...).
     """
-    short = joint.shortname().removeprefix("JointModel")
-    family = _FAMILIES.get(short)
-    if family is None:
+    family = joint_family(joint)
+    if family not in JOINT_ENTRIES:
         hint = "lock it (`lock`) or model it by revolute and prismatic joints"
-        raise UnsupportedJoint(f"joint '{name}' is of type {short}", where="symbolic dynamics", hint=hint)
+        raise UnsupportedJoint(f"joint '{name}' is of type {family}", where="symbolic dynamics", hint=hint)
     # S does not depend on the configuration, so any configuration can be used here.
     data = joint.createData()
     joint.calc(data, np.full(joint.idx_q + joint.nq, 0.5))

@@ -238,9 +238,9 @@ class ResolvedImpact:
 
 def robot_block(robot: Robot) -> dict[str, object]:
     """Return the ``robot`` block of ``result.json``."""
-    keys = ("name", "source", "model_sha256", "nq", "nv", "joint_names", "root", "convention", "joint_model")
-    lists = {"joint_names": [*robot.joint_names], "armature": robot.armature.tolist(), "locked": [*robot.locked]}
-    return {key: getattr(robot, key) for key in (*keys, "armature_source", "locked")} | lists
+    keys = ("name", "source", "model_sha256", "nq", "nv", "root", "convention", "joint_model", "armature_source")
+    lists = {key: [*getattr(robot, key)] for key in ("joint_names", "q_names", "locked")}
+    return {key: getattr(robot, key) for key in keys} | lists | {"armature": robot.armature.tolist()}
 
 
 def missing_support(robot: Robot) -> str:

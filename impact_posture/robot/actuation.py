@@ -15,7 +15,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from impact_posture.errors import FrameNotFound, PostureError, SpecError
-from impact_posture.robot.model_joints import finite_armature, is_free_flyer, joint_range
+from impact_posture.robot.model_joints import effort_unit, finite_armature, is_free_flyer, joint_range
 from impact_posture.robot.robot_spec import PropulsionSpec
 from impact_posture.system.arrays import Array
 
@@ -162,20 +162,20 @@ def hover(model: pin.Model, propulsion: PropulsionSpec, q: ArrayLike) -> Hover:
     thrusts = _centred_thrusts(matrix, load[:6], low, high)
     residual = float(np.max(np.abs(matrix @ thrusts - load[:6])))
     torques = load[6:].copy()
-    limits = np.asarray(model.effortLimit)[6:]
+    limits = torque_limits(model)[6:]
     width = high - low
     thrust_margin = float(np.min(np.minimum(thrusts - low, high - thrusts)) / width)
-    used = np.divide(np.abs(torques), limits, out=np.full(torques.shape, np.inf), where=limits > 0)
-    joints = [model.names[i] for i in joint_range(model) for _ in range(model.nvs[i])]
+    used = np.abs(torques) / limits
+    joints = [(model.names[i], effort_unit(model, i)) for i in joint_range(model) for _ in range(model.nvs[i])]
     violations = []
     if residual > _RESIDUAL:
         violations.append(f"the rotors leave {residual:.3g} (N or N·m) of the weight unbalanced")
     for rotor, thrust in zip(propulsion.rotors, thrusts, strict=True):
         if not low - 1e-9 * width <= thrust <= high + 1e-9 * width:
-            violations.append(f"{rotor.name} would need {thrust:.3g} N, outside [{low:.3g}, {high:.3g}]")
-    for name, torque, share in zip(joints, torques, used, strict=True):
-        if share > 1.0:
-            violations.append(f"{name} would need {torque:.3g} N·m, above its limit")
+            violations.append(f"{rotor.name} would need {thrust:.3g} N, outside {low:.3g} to {high:.3g} N")
+    for (name, unit), torque, limit in zip(joints, torques, limits, strict=True):
+        if abs(torque) > limit:
+            violations.append(f"{name} would need {torque:.3g} {unit}, above its limit {limit:.3g} {unit}")
     speeds = np.sqrt(np.maximum(thrusts, 0.0) / propulsion.thrust_coefficient)
     torque_margin = float(1.0 - np.max(used, initial=0.0))
     return Hover(thrusts, speeds, torques, thrust_margin, torque_margin, residual, tuple(violations))

@@ -9,10 +9,40 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impact_posture.errors import JointNotFound
+from impact_posture.errors import JointNotFound, PostureError, degrees_hint
 
 # Limits beyond this are no limits.  Pinocchio writes "no limit" as the largest double.
 ENDLESS = 1e10
+
+
+# Name of a Pinocchio joint type, without "JointModel" → family of the joint.
+_FAMILIES = {
+    **dict.fromkeys(("RX", "RY", "RZ", "RevoluteUnaligned"), "revolute"),
+    **dict.fromkeys(("RUBX", "RUBY", "RUBZ", "RevoluteUnboundedUnaligned"), "continuous"),
+    **dict.fromkeys(("PX", "PY", "PZ", "PrismaticUnaligned"), "prismatic"),
+    **{"FreeFlyer": "free-flyer", "Planar": "planar", "Spherical": "spherical", "Translation": "translation"},
+}
+# Family → names and units of its entries in ``q``.
+JOINT_ENTRIES = {
+    "revolute": ("(rad)",),
+    "continuous": ("cos", "sin"),
+    "prismatic": ("(m)",),
+    "free-flyer": ("x (m)", "y (m)", "z (m)", "qx", "qy", "qz", "qw"),
+    "planar": ("x (m)", "y (m)", "cos", "sin"),
+    "spherical": ("qx", "qy", "qz", "qw"),
+    "translation": ("x (m)", "y (m)", "z (m)"),
+}
+
+
+def joint_family(joint: pin.JointModel) -> str:
+    """Return the family of a joint, a key of :data:`JOINT_ENTRIES`, or the name of its type for all other types."""
+    short = str(joint.shortname()).removeprefix("JointModel")
+    return _FAMILIES.get(short, short)
+
+
+def effort_unit(model: pin.Model, index: int) -> str:
+    """Return the unit of the effort of a joint: N for a prismatic joint, N·m for all others."""
+    return "N" if joint_family(model.joints[index]) == "prismatic" else "N·m"
 
 
 def is_free_flyer(model: pin.Model) -> bool:
@@ -35,9 +65,23 @@ def v_slice(model: pin.Model, index: int) -> slice:
     return slice(int(model.idx_vs[index]), int(model.idx_vs[index] + model.nvs[index]))
 
 
-def scalar_entries(model: pin.Model, index: int, value: float) -> tuple[float, ...]:
-    """Return the entries in ``q`` of a joint with one degree of freedom: its value, or its cosine and sine."""
-    return (value,) if model.nqs[index] == 1 else (math.cos(value), math.sin(value))
+def scalar_entries(model: pin.Model, index: int, value: float, where: str) -> tuple[float, ...]:
+    """Return the entries in ``q`` of a joint with one degree of freedom: its value, or its cosine and sine.
+
+    Raises:
+        PostureError: A continuous joint is at a whole number beyond two turns, which is an angle in degrees.
+    """
+    if model.nqs[index] == 1:
+        return (value,)
+    if abs(value) > 4 * math.pi and value == round(value):
+        raise PostureError(f"joint '{model.names[index]}' is at {value:g}", where=where, hint=degrees_hint(value))
+    return math.cos(value), math.sin(value)
+
+
+def scalar_value(model: pin.Model, index: int, q: NDArray[np.float64]) -> float:
+    """Return the value of a joint with one degree of freedom at ``q``, shape (nq,); inverse of scalar_entries."""
+    entries = q[q_slice(model, index)]
+    return float(entries[0] if entries.size == 1 else math.atan2(entries[1], entries[0]))
 
 
 def joint_index(model: pin.Model, joint: str, where: str) -> int:

@@ -96,6 +96,6 @@ def _toml_postures(model: pin.Model, spec: RobotSpec, root: Root, name: str) -> 
                 raise SpecError(fault, where=name, hint="give it in an SRDF")
             if not np.isfinite(value):
                 raise SpecError(f"posture '{key}': joint '{joint}' is {value}", where=name, hint="give a number")
-            q[q_slice(model, index)] = scalar_entries(model, index, value)
+            q[q_slice(model, index)] = scalar_entries(model, index, value, where)
         result[key] = np.asarray(pin.normalize(model, q))
     return result

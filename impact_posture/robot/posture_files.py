@@ -14,15 +14,16 @@ from pathlib import Path
 import numpy as np
 
 from impact_posture.errors import JointLocked, JointNotFound, PostureError, PostureNotFound, nearest, shown
-from impact_posture.robot.model_joints import q_slice, scalar_entries
+from impact_posture.robot.model_joints import q_slice, scalar_entries, scalar_value
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 from impact_posture.system.text_files import read_text
 
 SCHEMA = "impact-posture/posture/1"
 
-_OUR_KEYS = ("schema", "robot", "convention", "joint_names", "q")
-_BY_NAME_KEYS = ("schema", "robot", "base", "joints")
+_KEYS = ("schema", "robot", "convention", "joint_names", "q", "q_names", "base", "joints")
+# Largest difference between ``q`` and the joints by name in one file, rad or m.
+_SAME = 1e-6
 _SHAPES = "q with joint_names, joints by name, or a JointState's name and position"
 
 _FIXED = ", but the root is fixed, with the root link at the world's origin along its axes"
@@ -65,8 +66,19 @@ def write_posture(robot: Robot, q: Array) -> dict[str, object]:
         "robot": robot.name,
         "convention": robot.convention,
         "joint_names": list(robot.joint_names),
-        "q": [float(v) for v in q],
+        "q": q.tolist(),
+        "q_names": list(robot.q_names),
+        **_named_values(robot, q),
     }
+
+
+def _named_values(robot: Robot, q: Array) -> dict[str, object]:
+    """Return ``q`` as ``base`` and ``joints`` by name, as :func:`set_joints` reads them."""
+    model, values = robot.model, dict[str, object]()
+    for name in robot.joint_names:
+        index = robot.joint_id(name)
+        values[name] = scalar_value(model, index, q) if model.nvs[index] == 1 else q[q_slice(model, index)].tolist()
+    return {**({"base": q[:7].tolist()} if robot.floating else {}), "joints": values}
 
 
 def posture_path(text: str) -> Path | None:
@@ -100,14 +112,14 @@ def _configuration(robot: Robot, data: Mapping[str, object], where: str) -> Arra
         fault = f"schema '{shown(schema)}' is not a posture"
         raise PostureError(fault, where=where, hint=f'give a file of "{SCHEMA}"')
     if "q" in data:
-        _only(data, _OUR_KEYS, where)
-        return _in_order(robot, data, where)
+        _only(data, where)
+        q = _in_order(robot, data, where)
+        if len(q) == robot.nq and ("joints" in data or "base" in data):
+            _check_same(robot, q, _by_name(robot, q, data, where), where)
+        return q
     if "joints" in data or "base" in data:
-        _only(data, _BY_NAME_KEYS, where)
-        joints = data.get("joints", {})
-        if not isinstance(joints, dict):
-            raise PostureError("'joints' is not a table", where=where, hint='write "joints": {"name": value}')
-        return _by_name(robot, {str(k): v for k, v in joints.items()}, data.get("base"), where)
+        _only(data, where)
+        return _by_name(robot, robot.posture(), data, where)
     if "name" in data and "position" in data:
         names, values = _names(data["name"], "name", where), _numbers(data["position"], "position", where)
         if len(names) != len(values):
@@ -117,10 +129,10 @@ def _configuration(robot: Robot, data: Mapping[str, object], where: str) -> Arra
     raise PostureError("holds no posture", where=where, hint=f"give {_SHAPES}")
 
 
-def _only(data: Mapping[str, object], known: Sequence[str], where: str) -> None:
+def _only(data: Mapping[str, object], where: str) -> None:
     for key in data:
-        if key not in known:
-            close = ", ".join(nearest(key, known))
+        if key not in _KEYS:
+            close = ", ".join(nearest(key, _KEYS))
             raise PostureError(f"unknown key '{shown(key)}'", where=where, hint=f"did you mean {close}?")
 
 
@@ -143,8 +155,11 @@ def _in_order(robot: Robot, data: Mapping[str, object], where: str) -> Array:
     return np.array(q)
 
 
-def _by_name(robot: Robot, joints: Mapping[str, object], base: object, where: str) -> Array:
-    q = robot.posture()
+def _by_name(robot: Robot, q: Array, data: Mapping[str, object], where: str) -> Array:
+    """Return ``q`` with the base and the joints that the file gives by name."""
+    joints, base, q = data.get("joints", {}), data.get("base"), q.copy()
+    if not isinstance(joints, dict):
+        raise PostureError("'joints' is not a table", where=where, hint='write "joints": {"name": value}')
     if base is not None:
         if not robot.floating:
             raise PostureError("gives a base pose" + _FIXED, where=where, hint=_NO_BASE)
@@ -152,7 +167,15 @@ def _by_name(robot: Robot, joints: Mapping[str, object], base: object, where: st
         if len(pose) != 7:
             raise PostureError(f"'base' has {len(pose)} numbers", where=where, hint="give [x, y, z, qx, qy, qz, qw]")
         q[:7] = pose
-    return set_joints(robot, q, joints, where)
+    return set_joints(robot, q, {str(name): value for name, value in joints.items()}, where)
+
+
+def _check_same(robot: Robot, q: Array, named: Array, where: str) -> None:
+    """Raise an error if a file gives two values for one entry of ``q``, because a user has edited only one."""
+    for name, one, other in zip(robot.q_names, q, named, strict=True):
+        if abs(one - other) > _SAME:
+            fault = f"{name} is {one:.6g} in q, but {other:.6g} by its name"
+            raise PostureError(fault, where=where, hint="remove q, or else base and joints")
 
 
 def set_joints(robot: Robot, q: Array, joints: Mapping[str, object], where: str) -> Array:
@@ -178,7 +201,7 @@ def set_joints(robot: Robot, q: Array, joints: Mapping[str, object], where: str)
             # A NaN in the cosine and sine of a continuous joint would be reported without the name of the joint.
             if not math.isfinite(angle):
                 raise PostureError(f"joint '{name}' is not finite", where=where, hint="correct it")
-            q[entries] = scalar_entries(robot.model, index, angle)
+            q[entries] = scalar_entries(robot.model, index, angle, where)
         else:
             numbers, nq = _numbers(value, f"joint '{name}'", where), int(robot.model.nqs[index])
             if len(numbers) != nq:

@@ -20,7 +20,7 @@ from impact_posture.errors import (
     PostureNotFound,
 )
 from impact_posture.robot.model_hash import dynamics_hash, hash_of, kinematics_hash, rounded
-from impact_posture.robot.model_joints import joint_range, q_slice
+from impact_posture.robot.model_joints import JOINT_ENTRIES, joint_family, joint_range, q_slice
 from impact_posture.robot.robot_spec import RobotSpec
 from impact_posture.system.arrays import Array
 
@@ -96,6 +96,12 @@ class Robot:
     def joint_names(self) -> tuple[str, ...]:
         """Names of the joints in the order of the model, without the free-flyer."""
         return tuple(self.model.names[i] for i in joint_range(self.model))
+
+    @cached_property
+    def q_names(self) -> tuple[str, ...]:
+        """Names of the nq entries of ``q`` with their units; a continuous joint has a cosine and a sine."""
+        named = [(self.model.names[k], joint_family(self.model.joints[k])) for k in range(1, self.model.njoints)]
+        return tuple(f"{name} {part}" for name, family in named for part in JOINT_ENTRIES.get(family, ()))
 
     @cached_property
     def tangent_names(self) -> tuple[str, ...]:
@@ -264,7 +270,8 @@ class Robot:
             for k in range(entries.start, entries.stop):
                 low, high = float(self.model.lowerPositionLimit[k]), float(self.model.upperPositionLimit[k])
                 if not low - _ON_LIMIT <= q[k] <= high + _ON_LIMIT:
-                    raise NotWithinLimits(joint, float(q[k]), low, high, where=where)
+                    angle = joint_family(self.model.joints[index]) == "revolute"
+                    raise NotWithinLimits(joint, float(q[k]), low, high, where=where, angle=angle)
 
 
 def unit_parts(model: pin.Model) -> list[tuple[int, slice]]:

@@ -10,7 +10,7 @@ import pinocchio as pin
 
 from impact_posture.errors import ImpactPostureError
 from impact_posture.robot.actuation import allocation, hover, lateral_force_range, thrust_limits
-from impact_posture.robot.model_joints import ENDLESS
+from impact_posture.robot.model_joints import ENDLESS, joint_family
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import known_robots
 from impact_posture.robot.robot_spec import PropulsionSpec, read_spec
@@ -59,6 +59,7 @@ def summarize(robot: Robot) -> dict[str, Any]:
         "convention": robot.convention,
         "nq": robot.nq,
         "nv": robot.nv,
+        "q_names": list(robot.q_names),
         "mass": robot.mass,
         "locked": list(robot.locked),
         "armature_source": robot.armature_source,
@@ -80,7 +81,7 @@ def _joint(robot: Robot, name: str) -> dict[str, Any]:
     model, index = robot.model, robot.joint_id(name)
     k, v = int(model.idx_qs[index]), int(model.idx_vs[index])
     nq, nv = int(model.nqs[index]), int(model.nvs[index])
-    family = _family(model.joints[index])
+    family = joint_family(model.joints[index])
     bounded = nq == nv == 1
     return {
         "name": name,
@@ -90,19 +91,10 @@ def _joint(robot: Robot, name: str) -> dict[str, Any]:
         "nv": nv,
         "lower": _limit(model.lowerPositionLimit[k]) if bounded else None,
         "upper": _limit(model.upperPositionLimit[k]) if bounded else None,
-        "velocity": _limit(model.upperVelocityLimit[v]),
-        "effort": _limit(model.upperEffortLimit[v]),
+        "velocity": _limit(model.upperVelocityLimit[v]) or None,
+        "effort": _limit(model.upperEffortLimit[v]) or None,
         "armature": float(robot.armature[v]),
     }
-
-
-def _family(joint: pin.JointModel) -> str:
-    short = str(joint.shortname()).removeprefix("JointModel")
-    if joint.nv > 1:
-        return short.lower()
-    if short.startswith("Prismatic") or short in ("PX", "PY", "PZ"):
-        return "prismatic"
-    return "continuous" if joint.nq == 2 else "revolute"
 
 
 def _frames(robot: Robot) -> list[dict[str, Any]]:

@@ -19,6 +19,7 @@ from impact_posture import __version__
 from impact_posture.errors import Infeasible, SolverFailed
 from impact_posture.robot.robot_loader import known_robots
 from impact_posture_cli import error_boundary as boundary
+from impact_posture_cli.argv import split_vectors
 from tests.support.command import run as start
 from tests.support.helpers import frame_jacobian, mass_matrix, relative, robot
 
@@ -308,6 +309,15 @@ def test_a_package_folder_is_looked_for_where_the_user_is(tmp_path: Path) -> Non
     assert start(*INSPECT, "--package-dir", "meshes", cwd=tmp_path).returncode == 0
 
 
+@pytest.mark.parametrize("normal", [["0,-0.6,0.8"], ["0,", "-0.6,", "0.8"], ["[0, -0.6, 0.8]"], ["0 -0.6 0.8"]])
+def test_vectors_may_have_commas_and_brackets(normal: list[str]) -> None:
+    plain = document("evaluate", "ur5", "--normal", "0", "-0.6", "0.8")
+    assert document("evaluate", "ur5", "--normal", *normal) == plain
+    assert split_vectors(["--normal=0,0,1", "a,b", "--box", "1", "2"], {"--normal": 3, "--box": 3}) == [
+        *("--normal", "0", "0", "1"), "a,b", "--box", "1", "2",
+    ]  # fmt: skip
+
+
 # ---- error boundary ---------------------------------------------------------------------------------------------
 
 
@@ -323,6 +333,7 @@ class Raises:
 
 BOUNDARY = [
     (Infeasible({"elbow": 0.25}), 3, "error: problem: the constraints conflict: elbow (off by 0.25); relax"),
+    (Infeasible({"e": 1.0}, {"e": "needs 2 N"}), 3, "error: problem: the constraints conflict: e (needs 2 N); relax"),
     (SolverFailed("no start converged", hint="more --starts"), 4, "error: no start converged; more --starts"),
     (KeyboardInterrupt(), 130, "error: interrupted\n"),
     (OSError(errno.ENOSPC, "No space left on device", "out"), 1, "error: out: No space left on device; free some"),

@@ -21,6 +21,7 @@ from impact_posture.robot.posture_files import posture_path, read_posture, write
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
 from tests.support.helpers import NAMES, random_configurations, rng, robot
+from tests.support.urdfs import joint, link, load
 
 
 def save(path: Path, data: object) -> str:
@@ -46,6 +47,26 @@ def test_a_written_posture_is_read_back(name: str, tmp_path: Path) -> None:
     path = save(tmp_path / "posture.json", write_posture(loaded, q))
     # Reading normalizes quaternions and angles again, so their last digit may change.
     assert np.allclose(read_posture(loaded, path), q, rtol=0, atol=1e-15)
+
+
+def test_posture_json_names_the_entries_of_q_and_gives_one_angle_per_joint(tmp_path: Path) -> None:
+    ends = [joint("a", "s u", kind="continuous", more=""), joint("b", "u f"), joint("c", "f t", kind="continuous")]
+    loaded = load(tmp_path, *(link(name, 1, "0.1 0 0") for name in "suft"), *ends)
+    path = save(tmp_path / "by_name.json", {"joints": {"a": 2.0, "b": -0.5, "c": -3.0}})
+    q = read_posture(loaded, path)
+    content = write_posture(loaded, q)
+    assert content["q_names"] == ["a cos", "a sin", "b (rad)", "c cos", "c sin"]
+    assert content["joints"] == pytest.approx({"a": 2.0, "b": -0.5, "c": -3.0}, abs=1e-15)
+    assert np.allclose(read_posture(loaded, save(tmp_path / "both.json", content)), q, rtol=0, atol=1e-15)
+    # A user may edit the angles, but not one of two contradicting values.
+    content["joints"] = {**content["joints"], "a": 1.0}  # type: ignore[dict-item]
+    with pytest.raises(PostureError, match=r"a cos is -0.416147 in q, but 0.540302 by its name; remove q"):
+        read_posture(loaded, save(tmp_path / "edited.json", content))
+    del content["q"]
+    assert read_posture(loaded, save(tmp_path / "edited.json", content))[0] == np.cos(1.0)
+    # A continuous joint has no limits, so that 90 degrees would silently be 90 radians.
+    with pytest.raises(PostureError, match=r"joint 'a' is at 90; degrees\? .* 90° are 1.5708"):
+        read_posture(loaded, save(tmp_path / "degrees.json", {"joints": {"a": 90}}))
 
 
 def test_posture_json_has_the_documented_keys() -> None:
@@ -138,11 +159,12 @@ FAULTS: list[tuple[str, object, type[ImpactPostureError], str]] = [
     ("short.json", {"q": HOME[:-1]}, PostureError, "has 10 numbers, this one 9"),
     ("text.json", {"q": [*HOME[:-1], "much"]}, PostureError, "'q' entry 9 is 'much', not a number"),
     ("truth.json", {"q": [*HOME[:-1], True]}, PostureError, "not a number"),
-    ("limits.json", {"joints": {"elbow_pitch": 3.0}}, NotWithinLimits, "outside its limits"),
+    ("limits.json", {"joints": {"elbow_pitch": 3.0}}, NotWithinLimits, "; choose a posture within the limits"),
+    ("degrees.json", {"joints": {"elbow_pitch": 90}}, NotWithinLimits, "90° are 1.5708"),
     ("swapped.json", {"base": [0, 0, 1, 1, 0, 0, 0], "joints": {}}, PostureError, "looks like w x y z"),
     ("norm.json", {"base": [0, 0, 1, 0, 0, 0, 2], "joints": {}}, PostureError, "norm 2"),
     ("base.json", {"base": [0, 0, 1], "joints": {}}, PostureError, "'base' has 3 numbers"),
-    ("key.json", {"joint": {}, "q": HOME}, PostureError, "unknown key 'joint'; did you mean joint_names"),
+    ("key.json", {"joint": {}, "q": HOME}, PostureError, "unknown key 'joint'; did you mean joints, joint_names"),
     ("schema.json", {"schema": "impact-posture/result/1", "q": HOME}, PostureError, "is not a posture"),
     ("broken.json", "{", PostureError, "is not valid JSON"),
     ("broken.yaml", "name: [", PostureError, "is not valid YAML"),
