@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from typing import TYPE_CHECKING, Any
 
+from impact_posture.errors import listed
 from impact_posture_cli.impact_tables import alone_line, contact_names, impact_rows, worst_lines, worst_tables
 from impact_posture_cli.output import Page, number
 
@@ -94,13 +95,12 @@ def summarize(page: Page, prepared: Prepared, solution: PostureSolution, documen
     hits = Counter[str]()
     for optimum in solution.optima:
         hits[number(optimum.objective)] += optimum.hits
-    optima = ", ".join(f"{value} ({count}×)" for value, count in list(hits.items())[:5])
-    more = f" and {len(hits) - 5} more" if len(hits) > 5 else ""
+    optima = listed([f"{value} ({count}×)" for value, count in hits.items()])
     left = solution.dominated_starts
     page.line(
         f"{solution.certified_starts} of {solution.starts} starts certified in {solution.solve_time_s:.1f} s; "
         + (f"{left} could not become the best (--finish-all); " if left else "")
-        + f"optima: {optima}{more}"
+        + f"optima: {optima}"
     )
     page.line(document["search"]["line"])
     if "global" in document:

@@ -11,14 +11,14 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.collision.coal_geometry import geometry_key, load_geometry
-from impact_posture.collision.shape_corners import shape_points
+from impact_posture.collision.shape_corners import ends, shape_points
 from impact_posture.collision.swept_hull import hull_corners
 from impact_posture.collision.urdf_shapes import UrdfShape, read_urdf_shapes
 from impact_posture.config.cached_values import StoredArray, read_stored, write_stored
 from impact_posture.config.demand import Vector3
 from impact_posture.robot.model_joints import rigid_groups
 from impact_posture.robot.robot import Robot
-from impact_posture.system.arrays import Array
+from impact_posture.system.arrays import Array, nonnegative_least_squares
 
 # Points less than this (m) behind the foremost point belong to the same flat front.
 _FLAT = 5e-4
@@ -124,7 +124,7 @@ def contact_front(
     heights = corners @ d
     most = float(heights.max())
     near = corners[heights > most - _FLAT]
-    x, y, z = (float(v) for v in _nearest(near - np.outer(near @ d, d), d) + most * d)
+    x, y, z = (float(v) for v in _nearest(near - np.outer(near @ d, d)) + most * d)
     return ContactFront(owners[int(heights.argmax())], (x, y, z), most - float(np.dot(offset, d)))
 
 
@@ -159,9 +159,9 @@ def _silhouettes(robot: Robot, described: list[UrdfShape]) -> tuple[Silhouette, 
             case coal.Sphere():
                 corners, ball = np.zeros((1, 3)), float(shape.radius)
             case coal.Capsule():
-                corners, ball = _ends(shape.halfLength), float(shape.radius)
+                corners, ball = ends(np.zeros((1, 3)), shape.halfLength), float(shape.radius)
             case coal.Cylinder():
-                corners, disk = _ends(shape.halfLength), shape.radius * at.rotation[:, 2]
+                corners, disk = ends(np.zeros((1, 3)), shape.halfLength), shape.radius * at.rotation[:, 2]
             case coal.Box():
                 corners = shape_points(shape)
             case _:
@@ -171,22 +171,8 @@ def _silhouettes(robot: Robot, described: list[UrdfShape]) -> tuple[Silhouette, 
     return tuple(result)
 
 
-def _ends(half_length: float) -> Array:
-    return np.array([[0.0, 0.0, half_length], [0.0, 0.0, -half_length]])
-
-
-def _nearest(flat: Array, axis: Array) -> Array:
-    """Return the point nearest to zero in the convex hull of points, shape (3,); zero lies in their plane."""
-    across = np.linalg.svd(axis[None])[2][1:]
-    points = flat @ across.T
-    angles = np.arange(_SIDES) * 2 * np.pi / _SIDES
-    # The farthest points along directions of increasing angle are the corners of the hull, in counter-clockwise
-    # order.
-    order = (points @ np.stack([np.cos(angles), np.sin(angles)])).argmax(axis=0)
-    start = points[order[np.flatnonzero(order != np.roll(order, 1))]] if np.ptp(order) else points[order[:1]]
-    edge = np.roll(start, -1, axis=0) - start
-    if len(start) > 2 and (edge[:, 1] * start[:, 0] - edge[:, 0] * start[:, 1] > 0).all():
-        return np.zeros(3)
-    along = -(start * edge).sum(axis=1) / np.maximum((edge**2).sum(axis=1), 1e-30)
-    nearest = start + np.clip(along, 0.0, 1.0)[:, None] * edge
-    return np.asarray(nearest[np.linalg.norm(nearest, axis=1).argmin()] @ across)
+def _nearest(flat: Array) -> Array:
+    """Return the point nearest to zero in the convex hull of points, shape (k, 3), m."""
+    # The weights minimize |Σ w p|² + (Σ w − 1)².  Divided by their sum, they give the nearest point.
+    weights = nonnegative_least_squares(np.vstack([flat.T, np.ones(len(flat))]), np.array([0.0, 0.0, 0.0, 1.0]))
+    return np.asarray(flat.T @ weights / weights.sum())

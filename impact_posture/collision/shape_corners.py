@@ -103,9 +103,9 @@ def shape_points(shape: Any) -> Array:
         case coal.Sphere():
             return _ball() * float(shape.radius)
         case coal.Cylinder():
-            return _ends(_circle() * float(shape.radius), shape.halfLength)
+            return ends(_circle() * float(shape.radius), shape.halfLength)
         case coal.Capsule():
-            return _ends(_ball() * float(shape.radius), shape.halfLength)
+            return ends(_ball() * float(shape.radius), shape.halfLength)
         case _:
             return mesh_points(shape)
 
@@ -116,7 +116,8 @@ def surface_of(shape: Any) -> tuple[Array, Triangles]:
     return (points, mesh_triangles(shape)) if isinstance(shape, coal.BVHModelBase) else hull_surface(points)
 
 
-def _ends(points: Array, half_length: float) -> Array:
+def ends(points: Array, half_length: float) -> Array:
+    """Return points moved along z to both ends of a shape of this half length, m, shape (2k, 3)."""
     return np.vstack([points + np.array([0, 0, side * half_length]) for side in (-1, 1)])
 
 

@@ -10,9 +10,9 @@ import numpy as np
 from impact_posture.dynamics.kinematics import ByJoint, PointOnLink
 from impact_posture.dynamics.model_parameters import ModelParameters
 from impact_posture.dynamics.spatial import (
-    cross,
     force_to_parent,
     inertia_to_parent,
+    motion_cross,
     motion_cross_force,
     motion_to_child,
     transposed_times,
@@ -86,10 +86,5 @@ class MovingTree(Tree):
             accelerations[i] = motion_to_child(self._R[i], self._p[i], start)
             if parent:
                 # For joints without a parent, the product is zero, because the link velocity is S ν itself.
-                accelerations[i] += _motion_cross(self._moving[i], self._S[i] @ self._v[slot.v])
+                accelerations[i] += motion_cross(self._moving[i], self._S[i] @ self._v[slot.v])
         return accelerations
-
-
-def _motion_cross(a: ca.SX, b: ca.SX) -> ca.SX:
-    """Return the cross product ``a × b`` of two motion vectors (Featherstone 2008, eq. 2.31)."""
-    return ca.vertcat(cross(a[3:], b[:3]) + cross(a[:3], b[3:]), cross(a[3:], b[3:]))

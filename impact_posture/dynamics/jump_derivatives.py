@@ -25,7 +25,15 @@ import casadi as ca
 import numpy as np
 
 from impact_posture.dynamics.kinematics import ByJoint, Kinematics, PointOnLink
-from impact_posture.dynamics.spatial import constant, cross, motion_cross_force, skew, symmetric, template
+from impact_posture.dynamics.spatial import (
+    constant,
+    cross,
+    motion_cross,
+    motion_cross_force,
+    skew,
+    symmetric,
+    template,
+)
 from impact_posture.system.arrays import Array
 
 # Joint families with one degree of freedom, whose velocity is the time derivative of the chart coordinate.
@@ -180,7 +188,7 @@ class JumpDerivatives:
             i, S = slot.index, self._subspaces[:, slot.v]
             velocity = S @ x[slot.v]
             if parent := self._parents[i]:
-                turned[i] = -_motion_cross(S, velocities[parent])
+                turned[i] = -motion_cross(S, velocities[parent])
                 velocity = velocity + velocities[parent]
             velocities[i], forces[i] = velocity, _momentum(self._inertias[i], velocity)
         start = 0
@@ -225,10 +233,3 @@ def _momentum(inertia: ca.SX, motion: ca.SX) -> ca.SX:
     """Return the momentum about the origin of the root link, ``[m v − h × w; h × v + I w]``."""
     h, v, w = inertia[:3, 3], motion[:3], motion[3:]
     return ca.vertcat(inertia[3, 3] * v - cross(h, w), cross(h, v) + inertia[:3, :3] @ w)
-
-
-@template
-def _motion_cross(first: ca.SX, second: ca.SX) -> ca.SX:
-    """Return the cross product of two motions, ``[w₁ × v₂ + v₁ × w₂; w₁ × w₂]``."""
-    v, w = first[:3], first[3:]
-    return ca.vertcat(cross(w, second[:3]) + cross(v, second[3:]), cross(w, second[3:]))

@@ -88,6 +88,13 @@ def force_to_parent(R: ca.SX, p: ca.SX, force: ca.SX) -> ca.SX:
 
 
 @template
+def motion_cross(first: ca.SX, second: ca.SX) -> ca.SX:
+    """Return ``first × second = [w₁ × v₂ + v₁ × w₂; w₁ × w₂]`` of two motions (Featherstone 2008, eq. 2.31)."""
+    v, w = first[:3], first[3:]
+    return ca.vertcat(cross(w, second[:3]) + cross(v, second[3:]), cross(w, second[3:]))
+
+
+@template
 def motion_cross_force(motion: ca.SX, force: ca.SX) -> ca.SX:
     """Return ``motion ×* force = [w × f; w × m + v × f]`` (Featherstone 2008, eq. 2.32)."""
     linear, angular = motion[:3], motion[3:]

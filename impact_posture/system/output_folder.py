@@ -15,7 +15,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Literal
 
-from impact_posture.errors import OutputError
+from impact_posture.errors import OutputError, listed
 from impact_posture.system.processes import signals_held, undone
 from impact_posture.system.scratch_folder import RECORD, SCHEMA, SCRATCH, made_by, remove_scratch, scratch_folder
 from impact_posture.system.text_files import read_text
@@ -178,8 +178,7 @@ def _check_ours(out: Path, kind: Kind) -> None:
         raise OutputError(fault, where=str(out), hint="choose another `out`")
     foreign = _foreign(out, set())
     if foreign:
-        more = f" and {len(foreign) - _SHOWN} more" if len(foreign) > _SHOWN else ""
-        fault = f"holds {', '.join(foreign[:_SHOWN])}{more}, which this command did not write"
+        fault = f"holds {listed(foreign, _SHOWN)}, which this command did not write"
         hint = "choose another `out`, or move that away: `force` replaces earlier results only"
         raise OutputError(fault, where=str(out), hint=hint)
 

@@ -16,7 +16,7 @@ from impact_posture.impact.impact_contact import point_on
 from impact_posture.posture.formulation.problem_file import dump_settings, prepare, read_settings, resolved_settings
 from impact_posture.posture.manifold.feasible_start import Projector, StartDraw, feasible_start
 from impact_posture.posture.manifold.null_space_path import null_space_path
-from impact_posture.posture.program.certificate import certify, nonnegative_least_squares, objective_gradients
+from impact_posture.posture.program.certificate import certify, objective_gradients
 from impact_posture.posture.program.constrained_problem import (
     RANK_TOLERANCE,
     ConstrainedProblem,
@@ -24,7 +24,7 @@ from impact_posture.posture.program.constrained_problem import (
     rank,
 )
 from impact_posture.posture.search.multistart import Optimum, distinct, hits_of_best, solve
-from impact_posture.system.arrays import null_space
+from impact_posture.system.arrays import nonnegative_least_squares, null_space
 from tests.output.views import PENDULUM
 from tests.support.helpers import central_gradient
 from tests.support.settings import make_settings
