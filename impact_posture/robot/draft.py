@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from impact_posture.config.problem_settings import LoadOptions, Root
-from impact_posture.errors import InputError, OutputError
+from impact_posture.errors import InputError, OutputError, UrdfError
 from impact_posture.robot import guessed_parts as guess
 from impact_posture.robot.foot_shape import foot_specs, support_depth
 from impact_posture.robot.robot import Robot
@@ -24,6 +24,8 @@ from impact_posture.system.output_folder import check_name
 # Smallest number of joints that lead to the contact frame, and the contact pose that is then guessed.  The guessed
 # pose leaves some freedom of motion.
 _POSES = ((7, "full"), (6, "aligned"), (4, "position"), (0, "free"))
+# Largest speed of a propeller in a draft, Hz.
+_SPEED = 100.0
 # Smallest distance (m) of the center of mass from the edges of the support polygon for com_over_feet.
 _LEAST_DEPTH = 0.02
 
@@ -68,7 +70,12 @@ def write_draft(robot: str, options: LoadOptions, out: Path | None, *, force: bo
 def draft_spec(located: Located, options: LoadOptions, folder: Path) -> Draft:
     """Return the draft for a URDF, with paths relative to ``folder``."""
     srdf = resolve_path(options.srdf, Path()) if options.srdf else guess.srdf_near(located.urdf)
-    robot = _load(located, options, options.root or "fixed", srdf)
+    try:
+        robot = _load(located, options, options.root or "fixed", srdf)
+    except UrdfError:  # A fixed robot without joints cannot move.
+        if options.root:
+            raise
+        robot = _load(located, options, "free-flyer", srdf)
     ends = guess.srdf_end_effectors(srdf)
     legs = [link for link, words in ends.items() if "leg" in words or "foot" in words]
     feet = guess.feet(robot, legs)
@@ -99,7 +106,7 @@ def draft_spec(located: Located, options: LoadOptions, folder: Path) -> Draft:
         draft.key("srdf", _path(srdf, folder), "as --srdf says" if options.srdf else "found near the URDF")
     draft.key("root", root, why, guessed=options.root is None)
     _model(draft, robot, options, folder)
-    if default == "neutral":
+    if default == "neutral" and robot.joint_names:
         base = ("base = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]",) if robot.floating else ()
         draft.note(
             "There is no named posture: optimizations start with all joints at zero or at the nearest limit, often "
@@ -114,6 +121,7 @@ def draft_spec(located: Located, options: LoadOptions, folder: Path) -> Draft:
     _constraints(draft, robot, supports, carrying, located.urdf)
     _limits(draft, robot)
     _armature(draft, robot, options)
+    _propulsion(draft, robot)
     return draft
 
 
@@ -131,10 +139,13 @@ def _model(draft: Draft, robot: Robot, options: LoadOptions, folder: Path) -> No
         dirs = [_path(Path(name), folder) for name in options.package_dir]
         draft.key("package_dirs", dirs, "as --package-dir says")
     wheels = () if robot.floating else guess.wheels(robot)
-    if options.lock or wheels:
+    spinning = [joint for link in guess.propellers(robot) for joint in guess.joints_to(robot, link)]
+    if options.lock or wheels or spinning:
         reasons = ["as --lock says"] if options.lock else []
         reasons += ["wheels by their names, the base stands still"] if wheels else []
-        draft.key("lock", [*options.lock, *wheels], ", and ".join(reasons), guessed=bool(wheels))
+        reasons += ["propellers by their names, because their spin does not change the impact"] if spinning else []
+        guessed = bool(wheels or spinning)
+        draft.key("lock", [*options.lock, *wheels, *spinning], ", and ".join(reasons), guessed=guessed)
     massless = [joint for joint in robot.locked if not any(fnmatchcase(joint, p) for p in options.lock)]
     if massless:
         draft.key("lock_massless", True, f"these joints move no mass: {', '.join(massless)}")
@@ -241,7 +252,7 @@ def _armature(draft: Draft, robot: Robot, options: LoadOptions) -> None:
     elif any(values.values()):
         low, high = min(v for v in values.values() if v), max(values.values())
         draft.note(f"Armature: read from the SRDF's rotor_params, {low:.3g} to {high:.3g} kg m^2 a joint.")
-    else:
+    elif values:
         draft.note(
             "No armature was found, so it is zero, and H can be wrong by orders of magnitude. Geared motors have an "
             "armature of gear ratio^2 x rotor inertia, kg m^2; write the values of the data sheet:",
@@ -249,6 +260,40 @@ def _armature(draft: Draft, robot: Robot, options: LoadOptions) -> None:
             "default = 0.01",
             'source = "the data sheet of ..."',
         )
+
+
+def _propulsion(draft: Draft, robot: Robot) -> None:
+    """Add a commented table ``[propulsion]`` if links are named like propellers."""
+    links, base = guess.propellers(robot), guess.base_frame(robot)
+    if not links or not robot.floating:
+        return
+    data, gravity = guess.upright_frames(robot), float(np.linalg.norm(robot.model.gravity.linear))
+    to_base = data.oMf[robot.frame_id(base)].inverse()
+    hubs = {link: to_base * data.oMf[robot.frame_id(link)] for link in links}
+    center = np.mean([hub.translation for hub in hubs.values()], axis=0)
+    # Neighbors around the center turn in opposite directions.
+    around = sorted(links, key=lambda link: np.arctan2(*(hubs[link].translation - center)[1::-1]))
+    coefficient = 2 * robot.mass * gravity / len(links) / _SPEED**2
+    lines = [
+        "[propulsion]", f"frame = {toml(base)}",
+        f"thrust_coefficient = {coefficient:.3g}  # N/Hz^2: twice the weight at {_SPEED:g} Hz, our choice",
+        "drag_ratio = 0.02  # m, drag moment per thrust", "speed_min = 10.0  # Hz", f"speed_max = {_SPEED:g}  # Hz",
+        "time_constant_up = 0.02  # s", "time_constant_down = 0.04  # s", 'source = "the data sheet of ..."',
+    ]  # fmt: skip
+    for link in links:
+        axis = hubs[link].rotation[:, 2] * (-1 if hubs[link].rotation[2, 2] < 0 else 1)
+        lines += [
+            "", "[[propulsion.rotors]]", f"name = {toml(link)}",
+            f"position = {toml(np.round(hubs[link].translation, 6).tolist())}",
+            f"direction = {toml(np.round(axis, 6).tolist())}", f"spin = {2 * (around.index(link) % 2) - 1}",
+        ]  # fmt: skip
+    text = (
+        "GUESS: these links are propellers by their names. Positions and directions (z axes) are from their frames, "
+        "spins alternate around the center. Replace all other numbers by the data sheet, and uncomment the table, so "
+        "that the thrusts limit the postures:"
+    )
+    draft.note(text, *lines)
+    draft.guesses.append(f"[propulsion], commented: propellers {', '.join(links)} by their names")
 
 
 def _path(path: Path, folder: Path) -> str:

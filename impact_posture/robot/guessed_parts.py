@@ -21,6 +21,7 @@ _FOOT = re.compile(r"sole|foot|feet|hoof|paw|toe|ankle", re.I)
 _ARM = re.compile(r"(?<!h)arm(?!ature)|shoulder|elbow|wrist|hand|gripper|head|neck", re.I)
 _WHEEL = re.compile(r"wheel|caster|track", re.I)
 _ROTOR = re.compile(r"rotor|propeller|motor", re.I)
+_PROPELLER = re.compile(r"rotor|propeller|(?:^|_)props?(?:_|\d|$)", re.I)
 _FINGER = re.compile(r"finger|thumb|gripper|jaw|knuckle|pinky|(?:^|_)(?:index|middle|ring|little|mrl)(?:_|$)", re.I)
 _TOOL = re.compile(r"tcp|tool|(?:^|_)ee(?:f|$|_)|end_?effector|grasp|tip$", re.I)
 _HAND = re.compile(r"gripper|hand|palm|flange", re.I)
@@ -145,9 +146,21 @@ def wheels(robot: Robot) -> tuple[str, ...]:
     return tuple(name for name in robot.joint_names if _WHEEL.search(name))
 
 
+def propellers(robot: Robot) -> tuple[str, ...]:
+    """Return the links with a name like "rotor" or "prop" on the base, or on joints of the base, if there are three.
+
+    Legged robots have none, because their links of this name are the rotors of motors.
+    """
+    model, base = robot.model, 1 if robot.floating else 0
+    on_base = {base, *(i for i in joint_range(model) if model.parents[i] == base and not len(model.children[i]))}
+    frames = (f for f in model.frames if f.type == pin.FrameType.BODY and f.parentJoint in on_base)
+    named = tuple(str(f.name) for f in frames if _PROPELLER.search(f.name))
+    return named if len(named) > 2 and not feet(robot) else ()
+
+
 def flies(robot: Robot) -> bool:
-    """Return whether the name of the robot or a frame suggests that the robot flies."""
-    return any(_FLYING.search(name) for name in (robot.name, *robot.frame_names))
+    """Return whether the name of the robot or of a frame suggests that the robot flies."""
+    return any(_FLYING.search(name) for name in (robot.name, *robot.frame_names)) or bool(propellers(robot))
 
 
 def srdf_near(urdf: Path) -> Path | None:
@@ -172,6 +185,8 @@ def likely_root(robot: Robot, feet: Sequence[str], srdf: Path | None) -> tuple[R
         return "free-flyer", f"the SRDF's posture {states[0]} has a base pose"
     if feet:
         return "free-flyer", f"it has feet: {', '.join(feet)}"
+    if not robot.joint_names:
+        return "free-flyer", "it has no joints"
     if flies(robot):
         return "free-flyer", "its names say that it flies"
     return "fixed", 'nothing says that its base moves; "free-flyer" if it does'

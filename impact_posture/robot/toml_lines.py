@@ -33,7 +33,7 @@ class Draft:
 
     def note(self, text: str, *example: str) -> None:
         """Add a comment, and an example that a user can uncomment."""
-        self.lines += ["", *comment_lines(text), *(f"# {line}" for line in example)]
+        self.lines += ["", *comment_lines(text), *(f"# {line}".rstrip() for line in example)]
 
 
 def comment_lines(text: str) -> list[str]:

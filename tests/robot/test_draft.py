@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import tomllib
 from pathlib import Path
@@ -12,9 +13,10 @@ import pinocchio as pin
 import pytest
 
 from impact_posture.config.problem_settings import LoadOptions
-from impact_posture.errors import InputError, OutputError
+from impact_posture.errors import InputError, OutputError, UrdfError
 from impact_posture.posture.formulation.problem_file import prepare
 from impact_posture.posture.search.multistart import solve
+from impact_posture.robot.actuation import hover
 from impact_posture.robot.draft import write_draft
 from impact_posture.robot.foot_shape import support
 from impact_posture.robot.guessed_parts import feet, tips
@@ -165,3 +167,51 @@ def test_b1_z1_stays_upright_with_its_draft(tmp_path: Path) -> None:
     for foot in FOUR:
         at = data.oMf[prepared.impact.robot.frame_id(foot)].translation
         assert at[2] < q[2] - 0.2 and at[0] < tip[0], json.dumps({foot: list(at)})
+
+
+QUAD_ARM = Path(__file__).parents[2] / "docs/examples/quad_arm"
+
+
+def uncommented(text: str) -> str:
+    """Return a draft with its commented table of propellers as a part of the file."""
+    before, table = text.split("# [propulsion]\n")
+    return before + "[propulsion]\n" + table.replace("\n# ", "\n").replace("\n#\n", "\n\n").removeprefix("# ")
+
+
+@pytest.mark.parametrize("turning", [False, True])
+def test_propellers_are_drafted_as_a_commented_table(turning: bool, tmp_path: Path) -> None:
+    """The frames of the example give the positions, directions and spins of the robot.toml written by hand."""
+    urdf = (QUAD_ARM / "quad_arm.urdf").read_text()
+    if turning:
+        urdf = re.sub(r'(name="rotor_\d_joint" type=)"fixed"', r'\1"continuous"', urdf)
+    (tmp_path / "quad_arm.urdf").write_text(urdf)
+    out, draft = write_draft(str(tmp_path / "quad_arm.urdf"), LoadOptions(), None)
+    assert read_spec(out).propulsion is None and any("propellers rotor_0, rotor_1" in line for line in draft.guesses)
+    out.write_text(uncommented(draft.text))
+    loaded, by_hand = load_robot(str(tmp_path / "quad_arm.urdf")), read_spec(QUAD_ARM / "quad_arm.toml").propulsion
+    assert loaded.root == "free-flyer" and loaded.joint_names == ("shoulder", "elbow")
+    propulsion = loaded.spec.propulsion
+    assert propulsion is not None and by_hand is not None
+    assert propulsion.rotors == by_hand.rotors and propulsion.frame == by_hand.frame
+    held = hover(loaded.model, propulsion, loaded.posture())
+    assert held.feasible and held.thrust_margin > 0.2
+
+
+def test_a_multirotor_without_joints_is_drafted(tmp_path: Path) -> None:
+    source = uri("iris_description/robots/iris_simple.urdf")
+    out, draft = write_draft(source, LoadOptions(), tmp_path / "iris.toml")
+    out.write_text(uncommented(draft.text))
+    loaded = load_robot(source, LoadOptions(config=str(out)))
+    assert (
+        loaded.spec.propulsion is not None and hover(loaded.model, loaded.spec.propulsion, loaded.posture()).feasible
+    )
+    # PX4: front right and back left turn counterclockwise.
+    assert [rotor.spin for rotor in loaded.spec.propulsion.rotors] == [1, 1, -1, -1]
+    with pytest.raises(UrdfError, match="has no movable joint"):
+        write_draft(source, LoadOptions(root="fixed"), tmp_path / "fixed.toml")
+
+
+def test_rotors_of_motors_are_no_propellers(tmp_path: Path) -> None:
+    _, draft = write_draft(uri("b1_description/urdf/b1.urdf"), LoadOptions(), tmp_path / "b1.toml")
+    assert "FL_hip_rotor" in (example_robot_data() / "b1_description/urdf/b1.urdf").read_text()
+    assert "propulsion" not in draft.text
