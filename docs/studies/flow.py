@@ -132,7 +132,7 @@ def _row(case: Case, count: int, request: Request) -> list[str]:
         # flow must not tilt further.
         tilted = max(FlowOptions().tilt, _tilt(robot, course.q))
         fits = certificate.holds() and flow.share(record.q) < 1.001 and _tilt(robot, record.q) < tilted + 0.001
-        away = np.abs(pin.difference(robot.model, course.q, record.q)[6 if robot.floating else 0 :]).max()
+        away = np.abs(pin.difference(robot.model, course.q, record.q)[robot.first_joint :]).max()
         optimum = problem.objective.value(record.q)
         if fits and away < 0.5 and optimum < end + 1e-6 * start:
             return Outcome(course, optimum, record.q, True)

@@ -92,7 +92,7 @@ def check_weights(robot: Robot, weights: Sequence[float] | None) -> None:
 
 def _from_limits(robot: Robot) -> Array:
     limits = robot.velocity_limits
-    base = 6 if robot.floating else 0
+    base = robot.first_joint
     # A floating base has no velocity limits.  1 m/s and 1 rad/s are used to include the base velocity in the norm.
     limits[:base] = 1.0
     for name, limit in zip(robot.tangent_names[base:], limits[base:], strict=True):
@@ -105,7 +105,7 @@ def _from_limits(robot: Robot) -> Array:
 def _from_file(robot: Robot, path: Path) -> Array:
     table = read_toml(path)
     values = np.ones(robot.nv)
-    base = 6 if robot.floating else 0
+    base = robot.first_joint
     for key, value in table.items():
         try:
             if key == "base" and base:

@@ -80,7 +80,7 @@ def with_joint_model(robot: Robot, joint_model: JointModel) -> Robot:
     """
     stated, table = robot.armature, transmissions(robot)
     armature = stated.copy()
-    joints = np.arange(robot.nv) >= (6 if robot.floating else 0)
+    joints = np.arange(robot.nv) >= robot.first_joint
     if joint_model == "link":
         armature = np.where(joints & ~table.rigid, 0.0, armature)
     elif joint_model == "locked":
@@ -108,7 +108,7 @@ def with_joint_model(robot: Robot, joint_model: JointModel) -> Robot:
 
 def describe_joints(robot: Robot) -> str:
     """Describe the joint model of a robot, for messages."""
-    armature = np.asarray(robot.model.armature)[6 if robot.floating else 0 :]
+    armature = np.asarray(robot.model.armature)[robot.first_joint :]
     held, kept = int(np.isinf(armature).sum()), int((np.isfinite(armature) & (armature > 0)).sum())
     words = {
         "reflected": "links and rotors",

@@ -112,6 +112,11 @@ class Robot:
             names += [joint] if width == 1 else [f"{joint}[{k}]" for k in range(width)]
         return tuple(names)
 
+    @property
+    def first_joint(self) -> int:
+        """Index of the first joint in ν, which is the number of velocity entries of a floating base."""
+        return 6 if self.floating else 0
+
     @cached_property
     def armature(self) -> Array:
         """Armature before changes by the joint model, shape (nv,), kg·m² (kg for prismatic joints)."""
@@ -121,7 +126,7 @@ class Robot:
     def velocity_limits(self) -> Array:
         """Velocity limits, rad/s or m/s, shape (nv,); infinite for entries without a limit."""
         limits = np.array(self.model.velocityLimit)
-        limits[: 6 if self.floating else 0] = np.inf
+        limits[: self.first_joint] = np.inf
         return np.where((limits > 0) & (limits < 1e10), limits, np.inf)
 
     @cached_property

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
+from impact_posture.config.json_block import jsonable
 from impact_posture.errors import ImpactPostureError
 from impact_posture.robot.actuation import allocation, hover, lateral_force_range, thrust_limits
 from impact_posture.robot.model_joints import ENDLESS, joint_family
@@ -49,7 +49,7 @@ def catalogue() -> list[dict[str, Any]]:
 def summarize(robot: Robot) -> dict[str, Any]:
     """Return joints, frames, mass, limits, postures, contact, supports and actuation of a robot."""
     spec = robot.spec
-    return {
+    summary: dict[str, Any] = jsonable({
         "name": robot.name,
         "kind": spec.kind,
         "description": spec.description,
@@ -59,22 +59,23 @@ def summarize(robot: Robot) -> dict[str, Any]:
         "convention": robot.convention,
         "nq": robot.nq,
         "nv": robot.nv,
-        "q_names": list(robot.q_names),
+        "q_names": robot.q_names,
         "mass": robot.mass,
-        "locked": list(robot.locked),
+        "locked": robot.locked,
         "armature_source": robot.armature_source,
         "joints": [_joint(robot, name) for name in robot.joint_names],
         "frames": _frames(robot),
         "postures": [_posture(robot, name) for name in robot.postures],
         "default_posture": robot.default_posture,
-        "contact": asdict(spec.contact)
+        "contact": vars(spec.contact)
         | {"pose": None if spec.contact.frame is None else robot.contact_pose(spec.contact.frame)},
-        "supports": [asdict(support) for support in spec.supports],
-        "constraints": asdict(spec.constraints),
+        "supports": spec.supports,
+        "constraints": spec.constraints,
         "actuation": _actuation(robot, spec.propulsion) if spec.propulsion and robot.floating else None,
-        "sources": list(spec.sources),
-        "warnings": list(robot.warnings),
-    }
+        "sources": spec.sources,
+        "warnings": robot.warnings,
+    })  # fmt: skip
+    return summary
 
 
 def _joint(robot: Robot, name: str) -> dict[str, Any]:
@@ -93,7 +94,7 @@ def _joint(robot: Robot, name: str) -> dict[str, Any]:
         "upper": _limit(model.upperPositionLimit[k]) if bounded else None,
         "velocity": _limit(model.upperVelocityLimit[v]) or None,
         "effort": _limit(model.upperEffortLimit[v]) or None,
-        "armature": float(robot.armature[v]),
+        "armature": robot.armature[v],
     }
 
 
@@ -117,7 +118,7 @@ def _posture(robot: Robot, name: str) -> dict[str, Any]:
         robot.check_posture(q, where=name)
     except ImpactPostureError as error:
         fault = error.what
-    return {"name": name, "default": name == robot.default_posture, "q": [float(v) for v in q], "fault": fault}
+    return {"name": name, "default": name == robot.default_posture, "q": q, "fault": fault}
 
 
 def _actuation(robot: Robot, propulsion: PropulsionSpec) -> dict[str, Any]:
@@ -135,15 +136,15 @@ def _actuation(robot: Robot, propulsion: PropulsionSpec) -> dict[str, Any]:
         entry: dict[str, Any] = {
             "posture": name,
             "feasible": held.feasible,
-            "thrusts": [float(v) for v in held.thrusts],
+            "thrusts": held.thrusts,
             "thrust_margin": held.thrust_margin,
-            "torque_margin": _finite(held.torque_margin),
-            "violations": list(held.violations),
+            "torque_margin": held.torque_margin,
+            "violations": held.violations,
             "lateral_force": None,
         }
         if pin.Quaternion(np.array(q[3:7])).toRotationMatrix()[2, 2] > 1 - 1e-6:
             lateral = lateral_force_range(model, propulsion, q)
-            entry["lateral_force"] = {side: _finite(force) for side, force in vars(lateral).items()}
+            entry["lateral_force"] = lateral
         postures.append(entry)
     return {
         "rotors": len(propulsion.rotors),
@@ -151,15 +152,11 @@ def _actuation(robot: Robot, propulsion: PropulsionSpec) -> dict[str, Any]:
         "thrust_min": low,
         "thrust_max": high,
         "rank": rotors.rank,
-        "condition": _finite(rotors.condition),
+        "condition": rotors.condition,
         "postures": postures,
         "source": propulsion.source,
     }
 
 
 def _limit(value: float) -> float | None:
-    return _finite(value) if abs(value) < ENDLESS else None
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
+    return value if abs(value) < ENDLESS else None

@@ -97,7 +97,7 @@ def measure(setup: Setup, run: Run) -> Metrics:
     for window in impacts:
         inside[series.slice(window.begin, window.end)] = True
     period = setup.scenario.control.period
-    base = 6 if setup.robot.floating else 0
+    base = setup.robot.first_joint
     rotors, joints = saturated(setup, series)
 
     def integral(values: Array) -> float:
@@ -170,14 +170,10 @@ def impact_load(setup: Setup, series: Series, window: Window) -> ImpactLoad:
     change = _change(setup, series, window, end)
     effect = impact_effect(setup.robot, change if len(change) else np.zeros(setup.robot.nv))
     impulse = series.impulse[max(ticks.stop - 1, k)] - series.impulse[k]
+    # The second push or throw has the opposite direction.
+    along = abs(float(setup.scenario.normal @ impulse))
     return ImpactLoad(
-        effect.base_linear,
-        effect.base_angular,
-        effect.joint,
-        # The second push or throw has the opposite direction.
-        abs(float(setup.scenario.normal @ impulse)),
-        float(series.peak[inside].max(initial=0.0)),
-        _largest(change),
+        **vars(effect), impulse=along, peak_force=float(series.peak[inside].max(initial=0.0)), jump=_largest(change)
     )
 
 

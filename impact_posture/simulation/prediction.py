@@ -90,7 +90,7 @@ def predict(setup: Setup, objective: WorstCaseObjective, run: Run) -> tuple[Pred
             coulomb = approach * float(np.sqrt(impact.jump @ objective.oracle.weigh(impact.jump)))
         expected = smooth if coulomb is None else coulomb
         effect, measured = impact_effect(setup.robot, velocity), impact_load(setup, run.series, window)
-        predicted = ImpactLoad(effect.base_linear, effect.base_angular, effect.joint, impulse, force, expected)
+        predicted = ImpactLoad(**vars(effect), impulse=impulse, peak_force=force, jump=expected)
         ratio = measured.jump / expected if expected > 1e-9 else None
         jumps = smooth, sticking, coulomb, measured.jump
         rigid = here.H, here.G, here.V, here.S

@@ -67,7 +67,7 @@ def _start(setup: Setup, size: float, generator: np.random.Generator) -> Array:
     for _ in range(_DRAWS):
         step = size * generator.uniform(-1, 1, robot.nv)
         step[held] = 0.0
-        step[: 6 if robot.floating else 0] *= 0.0 if setup.scenario.control.footing is None else _BASE
+        step[: robot.first_joint] *= 0.0 if setup.scenario.control.footing is None else _BASE
         q = np.clip(pin.integrate(model, setup.q, step), model.lowerPositionLimit, model.upperPositionLimit)
         if setup.scenario.control.footing is None:
             return robot.check_posture(q, where=setup.scenario.source)

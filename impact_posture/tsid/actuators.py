@@ -33,7 +33,7 @@ class Actuators:
     def __init__(self, robot: Robot) -> None:
         propulsion = robot.spec.propulsion
         self._propulsion = propulsion
-        self.base = 6 if robot.floating else 0
+        self.base = robot.first_joint
         self.G = actuation_matrix(robot.model, propulsion)
         rotor_names = () if propulsion is None else tuple(rotor.name for rotor in propulsion.rotors)
         self.rotors = len(rotor_names)

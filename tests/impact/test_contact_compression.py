@@ -102,7 +102,7 @@ def test_x_from_plain_matrices(name: str, frame: str) -> None:
     contact = ContactStiffness(linear=3e5)
     for q in random_configurations(loaded.model, 2, name, "x"):
         oracle = objective.oracle.at(q)
-        joints = slice(6 if loaded.floating else 0, None)
+        joints = slice(loaded.first_joint, None)
         M = oracle.M - np.diag(loaded.armature) + oracle.Js.T @ oracle.Js / objective.compliance
         j = oracle.n @ oracle.J
         G, C = j @ np.linalg.solve(M, j), np.sum(j[joints] ** 2) / 12000.0
@@ -182,7 +182,7 @@ def test_the_bounds_hold_and_cost(name: str, more: dict[str, object]) -> None:
     before, after = plain.impact.evaluate(free.initial), plain.impact.evaluate(free.q)
     assert before.compression is not None and after.compression is not None
     assert after.compression.peak_force is not None and before.coulomb is not None and after.coulomb is not None
-    joints = slice(6 if plain.impact.robot.floating else 0, None)
+    joints = slice(plain.impact.robot.first_joint, None)
     force, jump = 0.97 * after.compression.peak_force, 0.97 * np.abs(after.coulomb.velocity[joints]).max()
     bounded = prepare(
         make_settings({**settings_, "max_force": force, "max_torque": 3.0 * jump, "velocity_gain": 3.0})

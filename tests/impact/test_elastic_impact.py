@@ -105,7 +105,7 @@ class Stepped(NamedTuple):
 def stepped(case: ImpactCase, q: Vector, stiffness: float, speed: float) -> Stepped:
     """Integrate the equations of motion with Pinocchio's matrices, by an adaptive Runge–Kutta method."""
     result, spec = case.robot, case.robot.spec.transmission
-    nv, base = result.nv, 6 if result.floating else 0
+    nv, base = result.nv, result.first_joint
     own = [spec.joints.get(joint, JointTransmissionSpec()) for joint in result.joint_names]
     kinds = np.array(["base"] * base + [joint.kind or spec.kind or "none" for joint in own])
     K = np.array([0.0] * base + [joint.stiffness or spec.stiffness or 0.0 for joint in own])

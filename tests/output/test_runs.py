@@ -49,7 +49,7 @@ def make_run(name: str, *, push: bool = False) -> RunView:
     """A robot that oscillates about its posture for 4 s, with impacts at 1 s and 2.5 s, or a push at 1 s."""
     robot = load_robot(name)
     t = np.arange(1, TICKS + 1) * 0.01
-    base = 6 if robot.floating else 0
+    base = robot.first_joint
     swings = np.outer(np.sin(2 * t), 0.05 * np.random.default_rng(5).uniform(0.2, 1.0, robot.nv))
     q = np.array([pin.integrate(robot.model, robot.posture(), swing) for swing in swings])
     rotors = 0 if robot.spec.propulsion is None else len(robot.spec.propulsion.rotors)
@@ -209,7 +209,7 @@ def test_endless_joints_are_unwrapped_and_stops_are_marked() -> None:
     stop = run.at_stop.copy()
     stop[100:200, entry] = True
     run = dataclasses.replace(run, q=q, at_stop=stop)
-    np.testing.assert_allclose(run.positions[:, entry - run.first_joint], turns, atol=1e-9)
+    np.testing.assert_allclose(run.positions[:, entry - run.robot.first_joint], turns, atol=1e-9)
     figure = joints_figure([run])
     thick = [line for line in panels(figure)[0].lines if line.get_linewidth() == STOP["linewidth"]]
     assert len(thick) == 1 and np.isfinite(thick[0].get_ydata()).sum() == 100

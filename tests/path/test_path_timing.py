@@ -79,7 +79,7 @@ def test_limits_hold_at_the_rows_and_between_them(
     """The oracle is RNEA on the robot's model, with contact forces as sums of friction cone rays."""
     loaded, path, motion = moments
     model, data = loaded.model, loaded.model.createData()
-    base = 6 if loaded.floating else 0
+    base = loaded.first_joint
     allowed = 1.01
     fastest = max(float((np.abs(v) / model.velocityLimit).max()) for _, _, v, _ in motion)
     assert fastest <= allowed

@@ -148,7 +148,7 @@ def least_share(posed: ConstrainedProblem, q: Vector) -> float:
     if spec.propulsion is not None:
         rotors = np.vstack([allocation_matrix(model, spec.propulsion), np.zeros((model.nv - 6, 6))])
     B = np.hstack([np.zeros((model.nv, 0)), *blocks, rotors])
-    feet, base = 3 * len(blocks), 6 if posed.robot.floating else 0
+    feet, base = 3 * len(blocks), posed.robot.first_joint
     rows, right = [], []
     for k in np.flatnonzero(np.isfinite(limits)):
         for sign in (1, -1):

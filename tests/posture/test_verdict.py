@@ -61,7 +61,7 @@ def test_the_changes_follow_from_the_predicted_jumps(name: str, friction: float)
             assert (side.jump, side.impulse) == (evaluation.coulomb.norm, evaluation.coulomb.normal_impulse)
             assert (side.peak_force, side.sticks) == (evaluation.compression.peak_force, evaluation.coulomb.sticks)
             assert (side.base_linear is None) == (not robot.floating) and side.joint is not None
-            joints = slice(6 if robot.floating else 0, None)
+            joints = slice(robot.first_joint, None)
             shares = np.abs(jump[joints]) / robot.velocity_limits[joints]
             assert side.joint.share == pytest.approx(shares.max())
             if robot.floating:

@@ -74,7 +74,7 @@ def lived(name: str, controller: str, mode: Mode, settle: float | None) -> Run:
 def by_hand(setup: Setup, n: int, period: float = 1e-3, begin: float = 0.0, **columns: Any) -> Series:
     """Return a time series of n ticks at rest; ``columns`` replaces some values."""
     robot, propulsion = setup.robot, setup.robot.spec.propulsion
-    joints = robot.nv - (6 if robot.floating else 0)
+    joints = robot.nv - robot.first_joint
     rotors = 0 if propulsion is None else len(propulsion.rotors)
     middle = 0.0 if propulsion is None else (propulsion.speed_min + propulsion.speed_max) / 2
     nothing: dict[str, Any] = {

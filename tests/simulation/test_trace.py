@@ -23,7 +23,7 @@ def shaken(name: str, ticks: int = 40) -> tuple[World, list[ActuatorCommand]]:
     setup, random = shared_factory(name).setup, rng(name)
     robot, world = setup.robot, setup.world
     rotors = 0 if robot.spec.propulsion is None else len(robot.spec.propulsion.rotors)
-    joints = robot.nv - (6 if robot.floating else 0)
+    joints = robot.nv - robot.first_joint
     v = np.zeros(robot.nv)
     if robot.floating:
         # The flying robot must reach the surface within the simulated ticks.

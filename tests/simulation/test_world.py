@@ -38,7 +38,7 @@ def without_rotors(name: str) -> Robot:
 
 
 def idle(robot: Robot) -> ActuatorCommand:
-    joints = robot.nv - (6 if robot.floating else 0)
+    joints = robot.nv - robot.first_joint
     return ActuatorCommand(np.zeros(joints), NONE)
 
 

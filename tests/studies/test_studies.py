@@ -170,7 +170,7 @@ def test_counted_operations_agree_with_the_source(tmp_path: Path, name: str, fra
     for kind in ("add", "mul", "div"):
         assert counted[kind] == pytest.approx(text[kind], rel=0.02), kind
     # The C code computes all sines and cosines in one loop.
-    assert counted["trig"] == 2 * (samples.robot.nv - (6 if samples.robot.floating else 0))
+    assert counted["trig"] == 2 * (samples.robot.nv - samples.robot.first_joint)
     assert (packed is None) == (name == "ur5")
     assert packed is None or 0.2 * total(counted) < packed < 0.6 * total(counted)
 

@@ -58,7 +58,7 @@ def test_the_jump_is_the_least_change_of_energy(name: str) -> None:
 def test_each_row_has_the_room_of_its_limit(seed: int, name: str) -> None:
     limits, state, _ = limits_of(name, np.array([0.0, 0.6, 0.8]), duration=4e-3)
     r = robot(name)
-    first, acceleration = (6 if r.floating else 0), 300 * rng(seed).normal(size=r.nv)
+    first, acceleration = r.first_joint, 300 * rng(seed).normal(size=r.nv)
     A, lower, upper = limits.rows(state)
     before = state.v + 1e-3 * acceleration
     jump, impulse = (part @ before for part in limits.jump(state))

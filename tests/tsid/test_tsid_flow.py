@@ -36,7 +36,7 @@ Well = Callable[[Vector], tuple[float, Vector]]
 
 def well(r: Robot, goal: Vector, depth: float = 0.1) -> Well:
     """Return a quadratic objective around a posture, with ``depth`` as its minimum."""
-    base = 6 if r.floating else 0
+    base = r.first_joint
 
     def function(q: Vector) -> tuple[float, Vector]:
         away = np.array(pin.difference(r.model, goal, q))
@@ -50,7 +50,7 @@ def well(r: Robot, goal: Vector, depth: float = 0.1) -> Well:
 def goal_of(r: Robot, key: object, size: float) -> Vector:
     """Return a posture whose joints deviate by at most ``size`` rad from the default posture."""
     step = size * rng(r.name, key).uniform(-1, 1, r.nv)
-    step[: 6 if r.floating else 0] = 0.0
+    step[: r.first_joint] = 0.0
     return np.array(pin.integrate(r.model, r.posture(), step))
 
 
@@ -124,7 +124,7 @@ def test_no_limit_is_crossed_wherever_the_goal_is(name: str, seed: int) -> None:
 
 def valley(r: Robot, key: object) -> Well:
     """Return an objective like a steep, curved valley, in which the flow must turn while it moves fast."""
-    base = 6 if r.floating else 0
+    base = r.first_joint
     along, across = rng(r.name, key).normal(size=(2, r.nv - base)) / np.sqrt(r.nv - base)
 
     def function(q: Vector) -> tuple[float, Vector]:
@@ -180,7 +180,7 @@ def test_acceleration_uses_its_share_of_the_torque_beside_rest(name: str, weaker
     """The oracle is the recursive Newton-Euler algorithm; a least-norm solution distributes the base wrench."""
     r = robot(name)
     flow = flow_of(r, well(r, goal_of(r, "haste", 2.0)), weaker, speed=20.0, acceleration=100.0)
-    data, none, base = r.model.createData(), np.zeros(r.nv), 6 if r.floating else 0
+    data, none, base = r.model.createData(), np.zeros(r.nv), r.first_joint
     effort = weaker * r.model.effortLimit[base:]
     limited = effort > 0
     eased = np.sqrt(np.tile([1.0] * 3 + [100.0] * 3, 2))

@@ -156,7 +156,7 @@ def test_events_at_odd_moments_make_no_step(name: str, kind: str, spring: Spring
     controller.reset(r.posture(), v)
     q = np.array(pin.integrate(r.model, r.posture(), 0.2 * generator.normal(size=r.nv)))
     state = State(r, controller.formulation.points).update(q, v)
-    base, steps, t = (6 if r.floating else 0), [], 0.0
+    base, steps, t = r.first_joint, [], 0.0
     for _ in range(300):
         before = posture.desired(state).copy()
         if generator.random() < 0.08:

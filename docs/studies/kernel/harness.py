@@ -66,7 +66,7 @@ class Samples:
         rng, robot = np.random.default_rng(0), self.robot
         # The base has random positions and orientations; the joints are within 1 of the default posture.
         width = np.full(robot.nv, 1.0)
-        width[: 6 if robot.floating else 0] = np.pi / 2
+        width[: robot.first_joint] = np.pi / 2
         start = robot.posture()
         q = np.array([pin.integrate(robot.model, start, rng.uniform(-width, width)) for _ in range(COUNT)])
         n = rng.normal(size=(COUNT, 3))

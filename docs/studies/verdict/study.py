@@ -304,7 +304,7 @@ def _fastest(frames: list[str], speeds: Vector) -> dict[str, float]:
 def _worst_share(robot: Robot, jump: Vector) -> Vector:
     """Return the jump of each joint as a share of its velocity limit, shape (nv,); zero for a floating base."""
     shares = np.abs(jump) / robot.velocity_limits
-    shares[: 6 if robot.floating else 0] = 0.0
+    shares[: robot.first_joint] = 0.0
     return shares
 
 

@@ -270,7 +270,7 @@ def unknown_springs(case: ImpactCase, q: Array) -> tuple[str, ...]:
     A joint counts if its jump with the links alone is at least :data:`_MOVED` of the largest jump of a joint.
     """
     robot, table = case.robot, transmissions(case.robot)
-    joints = np.arange(robot.nv) >= (6 if robot.floating else 0)
+    joints = np.arange(robot.nv) >= robot.first_joint
     jump = ImpactOracle(replace(case, robot=with_joint_model(robot, "link"))).quantities(q).jump
     sizes = np.where(joints, np.abs(jump), 0.0)
     springless = joints & ~table.rigid & ~table.locked & ~table.elastic & (robot.armature > 0)

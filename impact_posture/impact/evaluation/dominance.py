@@ -38,7 +38,7 @@ def find_dominance(objective: WorstCaseObjective, quantities: ImpactQuantities) 
     """Return the joint with the largest share of ``H``: ``Σ a_i (Wa)_i / H`` over the entries of the joint."""
     robot, oracle = objective.robot, objective.oracle
     parts = quantities.jump * oracle.weigh(quantities.jump)
-    width = 6 if robot.floating else 0
+    width = robot.first_joint
     if quantities.H <= 0 or not robot.joint_names:
         return Dominance("", 0.0, float(quantities.H > 0), "no joint contributes to H")
     base = float(parts[:width].sum() / quantities.H)

@@ -51,9 +51,6 @@ class ImpactLoad(ImpactEffect):
     """Effects of an impact on base, joints and contact, as predicted or as measured.
 
     Attributes:
-        base_linear: Linear velocity jump of a floating base, m/s; ``None`` for a fixed base.
-        base_angular: Angular velocity jump of a floating base, rad/s; ``None`` for a fixed base.
-        joint: Joint with the largest ratio of velocity jump to velocity limit; ``None`` if there are no joints.
         impulse: Normal impulse at the first contact, N·s.
         peak_force: Largest normal force, N; ``None`` if it is unknown, or for several contacts.
         jump: Norm ``‖Δν‖_W`` of the jump of base and joints, with the weight matrix ``W`` of the metric.
@@ -85,7 +82,7 @@ def impact_effect(robot: Robot, velocity: Array) -> ImpactEffect:
 
 
 def _worst_joint(robot: Robot, sizes: Array) -> WorstJoint | None:
-    first, units = 6 if robot.floating else 0, tangent_units(robot)
+    first, units = robot.first_joint, tangent_units(robot)
     joints = np.arange(first, robot.nv)
     if not joints.size:
         return None

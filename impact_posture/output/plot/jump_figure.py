@@ -70,7 +70,7 @@ def jump_figure(view: ResultView) -> Figure:
 def groups_of(view: ResultView) -> list[tuple[str, list[int], str]]:
     """Return the groups of entries of ν that share a panel: name, indices and unit."""
     units = tangent_units(view.robot)
-    base = 6 if view.robot.floating else 0
+    base = view.robot.first_joint
     groups = [("base,\nlinear", [0, 1, 2], "m/s"), ("base,\nangular", [3, 4, 5], "rad/s")] if base else []
     for name, unit in (("joints", "rad/s"), ("sliding\njoints", "m/s")):
         groups.append((name, [k for k in range(base, view.robot.nv) if units[k] == unit], unit))

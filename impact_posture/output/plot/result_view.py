@@ -230,7 +230,7 @@ def _short(source: str) -> str:
 
 def _armature(robot: Robot) -> str:
     source = _short(robot.armature_source)
-    joints = robot.armature[6 if robot.floating else 0 :]
+    joints = robot.armature[robot.first_joint :]
     if not joints.size or not joints.any():
         return "zero" if source == "none" else f"zero ({source})"
     low, high = f"{joints.min():.2g}", f"{joints.max():.2g}"

@@ -221,7 +221,7 @@ def joint_panels(views: Sequence[RunView]) -> list[Panel]:
     for unit, label in (("rad", "joint angle  [rad]"), ("m", "sliding joint  [m]")):
         joints = [int(k) for k in shown if first.joint_units[k] == unit]
         if joints:
-            stopped = [view.at_stop[:, view.first_joint :][:, joints] for view in views]
+            stopped = [view.at_stop[:, view.robot.first_joint :][:, joints] for view in views]
             values = [view.positions[:, joints] for view in views]
             names = [first.joint_names[k] for k in joints]
             panels.append(Panel(label, names, values, stopped=stopped, note=" ".join(notes)))

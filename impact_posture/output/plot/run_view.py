@@ -74,7 +74,7 @@ class RunView:
         n, nv = len(self.t), self.robot.nv
         rotors = np.shape(self.rotor_command)[1:]
         shapes: dict[str, tuple[int, ...]] = {
-            "t": (n,), "q": (n, self.robot.nq), "v": (n, nv), "torque": (n, nv - self.first_joint),
+            "t": (n,), "q": (n, self.robot.nq), "v": (n, nv), "torque": (n, nv - self.robot.first_joint),
             "rotor_command": (n, *rotors), "rotor_speed": (n, *rotors), "force": (n, 3), "peak": (n,),
             "objective": (n,), "level": (n,), "at_stop": (n, nv),
         }  # fmt: skip
@@ -91,11 +91,6 @@ class RunView:
     def name(self) -> str:
         """Name of the run in figures of several runs."""
         return self.label or self.controller
-
-    @property
-    def first_joint(self) -> int:
-        """Index of the first joint in ν."""
-        return 6 if self.robot.floating else 0
 
     @property
     def impacts(self) -> tuple[Window, ...]:
@@ -115,12 +110,12 @@ class RunView:
     @property
     def joint_names(self) -> tuple[str, ...]:
         """Names of the entries of ν that belong to joints."""
-        return self.robot.tangent_names[self.first_joint :]
+        return self.robot.tangent_names[self.robot.first_joint :]
 
     @cached_property
     def joint_units(self) -> tuple[str, ...]:
         """Unit of each joint position, ``rad`` or ``m``."""
-        return tuple(unit.removesuffix("/s") for unit in tangent_units(self.robot)[self.first_joint :])
+        return tuple(unit.removesuffix("/s") for unit in tangent_units(self.robot)[self.robot.first_joint :])
 
     @cached_property
     def positions(self) -> Array:
@@ -136,12 +131,12 @@ class RunView:
                 # Pinocchio stores the cosine and sine of a continuous joint.
                 endless = int(model.nqs[joint]) == 2
                 positions[:, v] = np.unwrap(np.arctan2(q[:, at + 1], q[:, at])) if endless else q[:, at]
-        return positions[:, self.first_joint :]
+        return positions[:, self.robot.first_joint :]
 
     @property
     def torque_limits(self) -> Array:
         """Torque limit of each joint, N·m (N), shape (joints,); infinite without a limit."""
-        effort = np.array(self.robot.model.effortLimit, dtype=float)[self.first_joint :]
+        effort = np.array(self.robot.model.effortLimit, dtype=float)[self.robot.first_joint :]
         return np.where(effort > 0, effort, np.inf)
 
     @property

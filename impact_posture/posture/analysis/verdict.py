@@ -161,9 +161,7 @@ def _predicted(evaluation: Evaluation, jump: Jump) -> PredictedImpact:
 
 def _felt(jump: Jump, peak_force: float | None) -> PredictedImpact:
     return PredictedImpact(
-        base_linear=jump.effect.base_linear,
-        base_angular=jump.effect.base_angular,
-        joint=jump.effect.joint,
+        **vars(jump.effect),
         impulse=jump.normal_impulse,
         peak_force=peak_force,
         jump=jump.norm,

@@ -55,7 +55,7 @@ class ImpactBounds(Constraint):
         self._slips = objective.contact.friction > NO_FRICTION
         self._objective = replace(objective, kind="coulomb" if self._slips else "speed", normal_cone_deg=0.0)
         robot = objective.robot
-        moving = np.isfinite(robot.model.armature) & (np.arange(robot.nv) >= (6 if robot.floating else 0))
+        moving = np.isfinite(robot.model.armature) & (np.arange(robot.nv) >= robot.first_joint)
         self._joints = np.flatnonzero(moving) if np.isfinite(jump) else np.zeros(0, dtype=int)
         self._largest, self._jump = largest_mass, jump
         self.parameters = np.array(objective.contact.normal)

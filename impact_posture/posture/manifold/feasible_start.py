@@ -189,7 +189,7 @@ def random_posture(
 ) -> Array:
     """Return a random posture near ``near``, or anywhere within the limits; it may violate the constraints."""
     model = problem.robot.model
-    base = 6 if problem.robot.floating else 0
+    base = problem.robot.first_joint
     if near is not None:
         step = rng.normal(size=model.nv) * rng.uniform(0.1, 0.8)
         step[:base] *= 0.2

@@ -42,7 +42,7 @@ class CommandLimits:
     def __init__(self, robot: Robot, rotors: Rotors | None) -> None:
         propulsion = robot.spec.propulsion
         self._rotors, self._count = rotors, 0 if propulsion is None else len(propulsion.rotors)
-        effort = np.asarray(robot.model.effortLimit, dtype=float)[6 if robot.floating else 0 :]
+        effort = np.asarray(robot.model.effortLimit, dtype=float)[robot.first_joint :]
         # An effort limit of zero means that the model gives no limit.
         self.effort: Array = np.where(effort > 0, effort, np.inf)
 

@@ -111,7 +111,7 @@ class FlowDirection:
         self._tilting, self._angle, self._vertical = self._joints.size + edges.shape[0], 0.0, np.zeros(3)
         # The distance from the start counts joints only.
         self._pull = np.full(nv, options.rho)
-        self._pull[: 6 if robot.floating else 0] = 0.0
+        self._pull[: robot.first_joint] = 0.0
         self.B, self.gain, self.failures = np.zeros((nv, nv)), 0.0, 0
         # The QP always has nv variables.  The columns beyond the dimension of the redundancy are zero.
         self._qp = QP.empty(nv, self._joints.size + edges.shape[0] + (1 if robot.floating else 0) + controls)

@@ -67,7 +67,7 @@ class ReferenceFlowPosture(JointPosture):
         self._path = [robot.check_posture(q, limits=False) for q in visited]
         self._flow: ReferenceFlow | None = None
         self._lead = BodyTaskLead(robot.model)
-        slowest = float(self.kp[6 if robot.floating else 0 :].min(initial=np.inf))
+        slowest = float(self.kp[robot.first_joint :].min(initial=np.inf))
         self.settle = 4.0 / np.sqrt(slowest) if 0 < slowest < np.inf else 0.0
 
     @property

@@ -70,7 +70,7 @@ class AccelerationBounds:
         self._twice = np.sqrt(2 * law.deceleration)
         # The six accelerations of a floating base have no limits.
         self._largest = np.full(nv, law.acceleration)
-        self._largest[: 6 if robot.floating else 0] = np.inf
+        self._largest[: robot.first_joint] = np.inf
 
     def update(self, state: State) -> None:
         """Compute the bounds at ``state``."""

@@ -72,7 +72,7 @@ class ImpactLimits:
         contacts: Sequence[SupportContact] = (),
         period: float = 1e-3,
     ) -> None:
-        self._first = 6 if robot.floating else 0
+        self._first = robot.first_joint
         effort = np.asarray(robot.model.effortLimit, dtype=float)[self._first :]
         self._torque = np.where(effort > 0, effort, np.inf)
         self._rate = JointRanges(robot).velocity[self._first :]
