@@ -43,7 +43,7 @@ app = typer.Typer(
     name="impact-posture",
     cls=CommandGroup,
     help="Find the posture in which an impact disturbs a redundant robot least, see why, and export it as C code.",
-    epilog="Each command has its own --help. ROBOT: a name from 'impact-posture robots', or a path to a .urdf.",
+    epilog="Each command has its own --help. ROBOT: name from 'impact-posture robots', or path of a URDF or MJCF.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )

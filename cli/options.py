@@ -44,7 +44,7 @@ def _check_prefix(prefix: str | None) -> str | None:
 
 
 RobotName = Annotated[
-    str, typer.Argument(metavar="ROBOT", help="Known name, path to a .urdf, or example-robot-data:PATH.")
+    str, typer.Argument(metavar="ROBOT", help="Known name, path to a URDF or MJCF, or example-robot-data:PATH.")
 ]
 RobotOrResult = Annotated[
     str, typer.Argument(metavar="ROBOT|RESULT_DIR", help="A robot, or a folder that optimize wrote.")

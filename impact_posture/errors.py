@@ -198,6 +198,10 @@ class UrdfError(InputError):
     """The URDF or SRDF cannot be read or does not describe a robot."""
 
 
+class MjcfError(UrdfError):
+    """The MJCF cannot be compiled, or contains what a tree of independent joints cannot contain."""
+
+
 class InertiaError(UrdfError):
     """A link's mass or rotational inertia is physically impossible."""
 

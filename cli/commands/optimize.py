@@ -24,7 +24,8 @@ _RARELY = 200_000, 50, 100
 RobotOrProblem = Annotated[
     str,
     typer.Argument(
-        metavar="ROBOT|PROBLEM.toml", help="Known name, path to a .urdf, example-robot-data:PATH, or a problem."
+        metavar="ROBOT|PROBLEM.toml",
+        help="Known name, path to a URDF or MJCF, example-robot-data:PATH, or problem.",
     ),
 ]
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from docs.studies.core import Request, table
-from impact_posture.dynamics.mjcf import import_mujoco
 from impact_posture.simulation.world.contact_law import ContactLaw
 from impact_posture.simulation.world.scene import Physics
+from impact_posture.system.optional_package import import_mujoco
 from tests.support.restitution import ideal_restitution, measure_restitution
 
 TIMES = (0.002, 0.005, 0.01, 0.02)

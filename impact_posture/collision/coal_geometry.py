@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from typing import Any, NamedTuple
 
 import coal
@@ -10,9 +9,17 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from impact_posture.collision.mjcf_shapes import mjcf_shapes
 from impact_posture.collision.shape_corners import Corrected, shape_points
 from impact_posture.collision.shape_pairs import disabled_links, pairs_apart
-from impact_posture.collision.urdf_shapes import UnusableShape, UrdfShape, largest_extent, left_out
+from impact_posture.collision.urdf_shapes import (
+    UnusableShape,
+    UrdfShape,
+    UrdfShapes,
+    largest_extent,
+    left_out,
+    read_urdf_shapes,
+)
 from impact_posture.errors import one_line
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
@@ -35,6 +42,11 @@ class Geometry(NamedTuple):
     warnings: tuple[str, ...]
 
 
+def read_shapes(robot: Robot, first: str = "collision") -> UrdfShapes:
+    """Return the shapes in the URDF or MJCF of a robot; ``first`` selects its ``collision`` or ``visual`` shapes."""
+    return read_urdf_shapes(robot, first) if robot.mjcf is None else mjcf_shapes(robot.mjcf.model, first)
+
+
 def load_geometry(robot: Robot, described: list[UrdfShape]) -> Geometry:
     """Load the shapes in a URDF; leave out unusable shapes with a warning."""
     model, largest = robot.model, largest_extent(robot)
@@ -43,12 +55,11 @@ def load_geometry(robot: Robot, described: list[UrdfShape]) -> Geometry:
     loaded: dict[object, Corrected] = {}
     for shape in described:
         try:
-            key = (shape.kind, shape.sizes, shape.mesh)
-            if key not in loaded:
-                loaded[key] = shape.load(largest)
-            solids.append(loaded[key].mesh)
+            if shape.key not in loaded:
+                loaded[shape.key] = shape.load(largest)
+            solids.append(loaded[shape.key].mesh)
             kept.append(shape)
-            if not loaded[key].exact:
+            if not loaded[shape.key].exact:
                 why = f"the parts of {shape.mesh} cannot be separated; export it as one part"
                 warnings.append(one_line(f"shape {shape.name} is its convex hull: {why}"))
         except UnusableShape as fault:
@@ -103,8 +114,6 @@ def geometry_key(robot: Robot, described: list[UrdfShape]) -> str:
     content = [coal.__version__, robot.kinematics_sha256]
     for shape in described:
         content.append(repr((shape.name, shape.link, shape.kind, shape.sizes, shape.placement.homogeneous.tolist())))
-        if shape.mesh is not None:
-            with shape.mesh.open("rb") as file:
-                content.append(hashlib.file_digest(file, "sha256").hexdigest())
+        content.append(shape.content)
     content += sorted(" ".join(sorted(pair)) for pair in disabled_links(robot))
     return source_key(content, "collision")

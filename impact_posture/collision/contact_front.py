@@ -10,10 +10,10 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.collision.coal_geometry import geometry_key, load_geometry
+from impact_posture.collision.coal_geometry import geometry_key, load_geometry, read_shapes
 from impact_posture.collision.shape_corners import ends, shape_points
 from impact_posture.collision.swept_hull import hull_corners
-from impact_posture.collision.urdf_shapes import UrdfShape, read_urdf_shapes
+from impact_posture.collision.urdf_shapes import UrdfShape
 from impact_posture.config.cached_values import StoredArray, read_stored, write_stored
 from impact_posture.config.demand import Vector3
 from impact_posture.robot.model_joints import rigid_groups
@@ -131,7 +131,7 @@ def contact_front(
 @lru_cache(maxsize=64)
 def _shapes_near(robot: Robot, joint: int, held: tuple[str, ...]) -> tuple[Silhouette, ...]:
     """Return the shapes of the links that do not move relative to the link of a joint; meshes are cached on disk."""
-    described = read_urdf_shapes(robot)[0]
+    described = read_shapes(robot)[0]
     group = rigid_groups(robot.model, held)
     near = [shape for shape in described if group[_joint(robot, shape.link)] == group[joint]]
     if not near:

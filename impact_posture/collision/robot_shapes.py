@@ -10,12 +10,12 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.collision.coal_geometry import Geometry, geometry_key, load_geometry
+from impact_posture.collision.coal_geometry import Geometry, geometry_key, load_geometry, read_shapes
 from impact_posture.collision.hull_bodies import Body, merged_bodies
 from impact_posture.collision.joint_planes import JointPlanes, joint_planes
 from impact_posture.collision.shape_pairs import Pair, nested_pairs, pairs_of, touch_of, touching_by_design
 from impact_posture.collision.swept_hull import Fit, SweptHull, fit_hull
-from impact_posture.collision.urdf_shapes import UrdfShape, read_urdf_shapes
+from impact_posture.collision.urdf_shapes import UrdfShape
 from impact_posture.config.cached_values import StoredArray, read_stored, write_stored
 from impact_posture.errors import listed, one_line
 from impact_posture.robot.robot import Robot
@@ -62,7 +62,7 @@ class RobotShapes(FittedShapes):
     @cached_property
     def geometry(self) -> pin.GeometryModel:
         """The shapes of the URDF, with the pairs that must not touch."""
-        loaded = load_geometry(self.robot, read_urdf_shapes(self.robot).shapes)
+        loaded = load_geometry(self.robot, read_shapes(self.robot).shapes)
         names = [shape.name for shape in loaded.model.geometryObjects]
         touching = set(self.always_touching)
         for i, j in pairs_of(loaded.apart):
@@ -115,7 +115,7 @@ class _LoadedShapes:
 
 
 def _source(robot: Robot) -> _Source:
-    read = read_urdf_shapes(robot)
+    read = read_shapes(robot)
     key = geometry_key(robot, read.shapes)
     return _Source(key, robot, read.shapes, tuple(read.warnings), tuple(read.described))
 

@@ -60,13 +60,18 @@ def correct(shape: Any) -> Corrected:
     exact = triangles is not None
     if triangles is None:
         points, triangles = hull_surface(points)
+    return Corrected(triangle_mesh(points, triangles), exact)
+
+
+def triangle_mesh(points: Array, triangles: Triangles) -> Any:
+    """Return the coal mesh with these corners, shape (k, 3), m, and triangles, shape (n, 3)."""
     mesh = coal.BVHModelOBBRSS()
     mesh.beginModel(len(triangles), len(points))
     mesh.addVertices(points)
     mesh.addTriangles(triangles)
     mesh.endModel()
     mesh.computeLocalAABB()
-    return Corrected(mesh, exact)
+    return mesh
 
 
 def renumbered(count: int, faces: Triangles) -> Triangles | None:
@@ -102,6 +107,8 @@ def shape_points(shape: Any) -> Array:
             return np.asarray(np.array(list(product((-1.0, 1.0), repeat=3))) * shape.halfSide)
         case coal.Sphere():
             return _ball() * float(shape.radius)
+        case coal.Ellipsoid():
+            return np.asarray(_ball() * np.array(shape.radii))
         case coal.Cylinder():
             return ends(_circle() * float(shape.radius), shape.halfLength)
         case coal.Capsule():

@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from impact_posture.collision.mjcf_shapes import disabled_bodies
 from impact_posture.collision.swept_hull import SweptHull, separation, transform
 from impact_posture.errors import UrdfError
 from impact_posture.robot.model_joints import v_slice
@@ -127,15 +128,16 @@ def random_postures(robot: Robot, count: int) -> Iterator[Array]:
 
 
 def disabled_links(robot: Robot) -> set[frozenset[str]]:
-    """Return the pairs of links that the SRDF allows to touch."""
+    """Return the pairs of links that the SRDF or the MJCF allows to touch."""
     if robot.settings is None:
         return set()
+    pairs = set() if robot.mjcf is None else disabled_bodies(robot.mjcf.model)
     located = locate(robot.settings.robot, robot.settings)
     path = srdf_path(located.spec, robot.settings, located.folder)
     if path is None:
-        return set()
+        return pairs
     try:
         tags = ET.parse(path).getroot().iter("disable_collisions")
     except (OSError, ET.ParseError) as error:
         raise UrdfError(f"is not an SRDF ({error})", where=str(path), hint="correct the SRDF") from None
-    return {frozenset((tag.get("link1", ""), tag.get("link2", ""))) for tag in tags}
+    return pairs | {frozenset((tag.get("link1", ""), tag.get("link2", ""))) for tag in tags}

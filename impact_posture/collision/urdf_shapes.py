@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 import xml.etree.ElementTree as ET
@@ -87,6 +88,19 @@ class UrdfShape:
     sizes: tuple[float, ...]
     mesh: Path | None = None
     color: tuple[float, ...] | None = None
+
+    @property
+    def key(self) -> object:
+        """Shapes with the same key have the same coal shape."""
+        return self.kind, self.sizes, self.mesh
+
+    @property
+    def content(self) -> str:
+        """Hash of the mesh file; empty without a mesh."""
+        if self.mesh is None:
+            return ""
+        with self.mesh.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
 
     @cached_property
     def y_up(self) -> bool:

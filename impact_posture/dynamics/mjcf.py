@@ -7,8 +7,7 @@ order of joints.  The model has no geometry.  A simulation adds shapes with :met
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -21,6 +20,7 @@ from impact_posture.errors import InputError
 from impact_posture.robot.model_joints import ENDLESS
 from impact_posture.system.arrays import Array
 from impact_posture.system.escape import xml_name
+from impact_posture.system.optional_package import import_mujoco
 
 Geom = Literal["sphere", "box", "plane"]
 
@@ -104,16 +104,6 @@ class Mjcf:
         if self.moments:
             mujoco.mj_setConst(model, mujoco.MjData(model))
         return model
-
-
-def import_mujoco() -> Any:
-    """Return the module ``mujoco``; raise InputError if MuJoCo is not installed."""
-    try:
-        import mujoco
-    except ImportError:
-        hint = "pip install 'impact-posture[sim]'"
-        raise InputError("MuJoCo is not installed", where="the extra 'sim'", hint=hint) from None
-    return mujoco
 
 
 def pose(placement: pin.SE3) -> dict[str, Array]:
@@ -262,15 +252,3 @@ def _add_sites(elements: dict[int, Any], model: pin.Model) -> dict[int, str]:
             sites[k] = _unique(str(frame.name), taken)
             elements[int(frame.parentJoint)].add_site(name=sites[k], **pose(frame.placement))
     return sites
-
-
-@contextmanager
-def unwarned() -> Iterator[None]:
-    """Prevent MuJoCo from writing warnings to a log file in the working directory."""
-    mujoco = import_mujoco()
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda message: None)
-    try:
-        yield
-    finally:
-        mujoco.set_mju_user_warning(before)

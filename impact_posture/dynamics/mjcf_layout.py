@@ -20,6 +20,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impact_posture.dynamics.chart import Chart, JointSlot
+from impact_posture.robot.model_joints import is_free_flyer
 from impact_posture.system.arrays import Array
 
 
@@ -133,6 +134,11 @@ class MjcfLayout:
             start, begin = slot.joint.v.start, slot.qvel.start
             v[start : start + len(turn)] = qvel[begin : begin + len(turn)] @ turn
         return q, v
+
+
+def file_layout(joints: pin.Model) -> MjcfLayout:
+    """Return the layout of a compiled MJCF for the model that :mod:`impact_posture.robot.mjcf_model` makes of it."""
+    return MjcfLayout(joints, range(1, joints.njoints), frozenset({1} if is_free_flyer(joints) else ()))
 
 
 def _turn(slot: MjcfSlot, piece: Array) -> Array:

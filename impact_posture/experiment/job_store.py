@@ -14,8 +14,7 @@ from dataclasses import asdict
 from functools import cache
 from pathlib import Path
 
-from impact_posture.collision.coal_geometry import geometry_key
-from impact_posture.collision.urdf_shapes import read_urdf_shapes
+from impact_posture.collision.coal_geometry import geometry_key, read_shapes
 from impact_posture.errors import ImpactPostureError, InputError, MetricError, OutputError
 from impact_posture.experiment.jobs import Document, Job, controller_factory, execute, lost_control, software
 from impact_posture.posture.program.ipopt import one_blas_thread
@@ -161,7 +160,7 @@ def _scenario(scenario: str) -> str:
     shapes = ""
     # A mesh that cannot be read has no effect on the results, so it is not part of the hash.
     with suppress(OSError):
-        shapes = geometry_key(setup.robot, read_urdf_shapes(setup.robot)[0])
+        shapes = geometry_key(setup.robot, read_shapes(setup.robot)[0])
     text = scenario_path(scenario).read_text(encoding="utf-8")
     return "\0".join((text, setup.robot.data_sha256, repr(setup.q.tolist()), shapes))
 

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from impact_posture.config.json_block import jsonable
-from impact_posture.dynamics.mjcf import import_mujoco
 from impact_posture.errors import InputError
 from impact_posture.impact.evaluation.impact_effect import mean_load
 from impact_posture.posture.analysis.result_document import versions
@@ -22,6 +21,7 @@ from impact_posture.simulation.run import Run, run
 from impact_posture.simulation.scenario_file import read_scenario
 from impact_posture.simulation.seed_variation import set_up_with
 from impact_posture.system.escape import file_name
+from impact_posture.system.optional_package import import_mujoco
 
 Document = dict[str, Any]
 

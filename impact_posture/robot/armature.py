@@ -20,7 +20,7 @@ ArmatureOption = Mapping[str, float] | str | None
 def set_armature(model: pin.Model, spec: RobotSpec, srdf: Path | None, option: ArmatureOption, name: str) -> str:
     """Set ``model.armature``, kg·m² (kg for prismatic joints); return a description of the source of the values.
 
-    The source is the option, or else robot.toml, or else the rotor data of the SRDF, or else zero.
+    The source is the option, or else robot.toml, or else the rotor data of the SRDF, or else the MJCF, or else zero.
 
     Raises:
         InputError: A joint does not exist, a value is below zero, or a file cannot be read.
@@ -28,7 +28,8 @@ def set_armature(model: pin.Model, spec: RobotSpec, srdf: Path | None, option: A
     if option == "none":
         model.armature = np.zeros(model.nv)
         return "none (given)"
-    armature, source = np.array(model.armature, dtype=float), "none"
+    armature = np.array(model.armature, dtype=float)
+    source = "MJCF" if armature.any() else "none"
     if spec.armature.default is not None or spec.armature.joints:
         armature[:] = spec.armature.default or 0.0
         _set_joints(model, armature, spec.armature.joints, f"{name} [armature]")

@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 
 from impact_posture.config.problem_settings import LoadOptions, Root
-from impact_posture.errors import InputError, OutputError, UrdfError
+from impact_posture.errors import InputError, MjcfError, OutputError, UrdfError
 from impact_posture.robot import guessed_parts as guess
 from impact_posture.robot.foot_shape import foot_specs, support_depth
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import Located, build_robot, known_robots, load_robot, locate
 from impact_posture.robot.robot_spec import SCHEMA, ModelSpec, RobotSpec, Support
 from impact_posture.robot.toml_lines import Draft, comment_lines
-from impact_posture.robot.urdf import EXAMPLE_PREFIX, example_robot_data, parse_urdf, resolve_path
+from impact_posture.robot.urdf import EXAMPLE_PREFIX, example_robot_data, resolve_path
 from impact_posture.system.escape import toml
 from impact_posture.system.output_folder import check_name
 
@@ -71,15 +71,20 @@ def draft_spec(located: Located, options: LoadOptions, folder: Path) -> Draft:
     """Return the draft for a URDF, with paths relative to ``folder``."""
     srdf = resolve_path(options.srdf, Path()) if options.srdf else guess.srdf_near(located.urdf)
     try:
-        robot = _load(located, options, options.root or "fixed", srdf)
-    except UrdfError:  # A fixed robot without joints cannot move.
-        if options.root:
+        robot = _load(located, options, options.root, srdf)
+    except UrdfError as error:  # A fixed robot without joints cannot move.
+        if options.root or isinstance(error, MjcfError):
             raise
         robot = _load(located, options, "free-flyer", srdf)
     ends = guess.srdf_end_effectors(srdf)
     legs = [link for link, words in ends.items() if "leg" in words or "foot" in words]
     feet = guess.feet(robot, legs)
-    root, why = (options.root, "as --root says") if options.root else guess.likely_root(robot, feet, srdf)
+    if options.root:
+        root, why = options.root, "as --root says"
+    elif robot.mjcf is not None:
+        root, why = robot.root, "as the MJCF"
+    else:
+        root, why = guess.likely_root(robot, feet, srdf)
     if root != robot.root:
         robot = _load(located, options, root, srdf)
     if root == "fixed":
@@ -87,24 +92,24 @@ def draft_spec(located: Located, options: LoadOptions, folder: Path) -> Draft:
     default = guess.start_posture(robot)
     draft = Draft(
         comment_lines(
-            f"Data of {robot.name} that a URDF cannot hold, drafted by impact-posture inspect --write-robot-toml. "
+            f"Data of {robot.name} that its {_file(robot, 'URDF')} cannot hold, drafted by impact-posture inspect "
+            "--write-robot-toml. "
             "GUESS marks values from names and geometry alone: check them before you trust a result. This file is "
-            "read as robot.toml beside the URDF, else by --config."
+            "read as robot.toml beside that file, else by --config."
         )
     )
     draft.lines.append(f'schema = "{SCHEMA}"')
-    draft.key("name", robot.name, "the URDF's file name")
+    draft.key("name", robot.name, f"the name of the {_file(robot, 'URDF')}")
     kind, reason = guess.likely_kind(robot, feet)
     draft.key("kind", kind, reason, guessed=True)
     if states := ", ".join(name for name in robot.postures if name != "neutral"):
-        chosen = (
-            f"the SRDF names {states}" if default != "neutral" else f"the SRDF has only {states}, beyond joint limits"
-        )
+        only = ", which are beyond joint limits" if default == "neutral" else ""
+        chosen = f"the {_file(robot, 'SRDF')} names {states}{only}"
         draft.key("default_posture", default, chosen, guessed=True)
     draft.lines += ["", "[model]"]
     if srdf is not None:
         draft.key("srdf", _path(srdf, folder), "as --srdf says" if options.srdf else "found near the URDF")
-    draft.key("root", root, why, guessed=options.root is None)
+    draft.key("root", root, why, guessed=options.root is None and robot.mjcf is None)
     _model(draft, robot, options, folder)
     if default == "neutral" and robot.joint_names:
         base = ("base = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]",) if robot.floating else ()
@@ -118,14 +123,14 @@ def draft_spec(located: Located, options: LoadOptions, folder: Path) -> Draft:
     carrying = _contact(draft, robot, feet, [link for link in ends if link not in legs])
     supports = foot_specs(robot, feet, located.urdf)
     _supports(draft, robot, supports)
-    _constraints(draft, robot, supports, carrying, located.urdf)
+    _constraints(draft, robot, supports, carrying)
     _limits(draft, robot)
     _armature(draft, robot, options)
     _propulsion(draft, robot)
     return draft
 
 
-def _load(located: Located, options: LoadOptions, root: Root, srdf: Path | None) -> Robot:
+def _load(located: Located, options: LoadOptions, root: Root | None, srdf: Path | None) -> Robot:
     """Load the robot without a robot.toml; impossible inertias become warnings."""
     plain = LoadOptions(
         package_dir=options.package_dir, armature=options.armature, lock=options.lock, lock_massless=True
@@ -202,10 +207,9 @@ def _supports(draft: Draft, robot: Robot, feet: Sequence[Support]) -> None:
             draft.key("size", list(foot.size), "the sole, from its collision shapes")
 
 
-def _constraints(draft: Draft, robot: Robot, feet: Sequence[Support], carrying: Sequence[str], urdf: Path) -> None:
-    mimics = {j.get("name") for j in parse_urdf(urdf).iter("joint") if j.find("mimic") is not None}
+def _constraints(draft: Draft, robot: Robot, feet: Sequence[Support], carrying: Sequence[str]) -> None:
     free = [joint for joint in robot.joint_names if joint not in carrying]
-    hold = [joint for joint in free if joint in mimics or joint in guess.fingers(robot)]
+    hold = [joint for joint in free if joint in robot.mimics or joint in guess.fingers(robot)]
     keys = Draft()
     if hold:
         keys.key("hold", hold, "fingers and grippers by their names, joints that mimic others", guessed=True)
@@ -251,7 +255,8 @@ def _armature(draft: Draft, robot: Robot, options: LoadOptions) -> None:
         draft.key("joints", values, "kg m^2 (kg for a prismatic joint); values given with --armature")
     elif any(values.values()):
         low, high = min(v for v in values.values() if v), max(values.values())
-        draft.note(f"Armature: read from the SRDF's rotor_params, {low:.3g} to {high:.3g} kg m^2 a joint.")
+        source = _file(robot, "rotor_params of the SRDF")
+        draft.note(f"Armature: read from the {source}, {low:.3g} to {high:.3g} kg m^2 a joint.")
     elif values:
         draft.note(
             "No armature was found, so it is zero, and H can be wrong by orders of magnitude. Geared motors have an "
@@ -294,6 +299,10 @@ def _propulsion(draft: Draft, robot: Robot) -> None:
     )
     draft.note(text, *lines)
     draft.guesses.append(f"[propulsion], commented: propellers {', '.join(links)} by their names")
+
+
+def _file(robot: Robot, otherwise: str) -> str:
+    return "MJCF" if robot.mjcf is not None else otherwise
 
 
 def _path(path: Path, folder: Path) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -14,6 +14,7 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.robot.guessed_parts import joints_to, upright_frames
+from impact_posture.robot.mjcf_geoms import geoms_of
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_spec import Support
 from impact_posture.robot.support_polygon import polygon_edges
@@ -71,8 +72,14 @@ def support_depth(robot: Robot, feet: Sequence[Support]) -> float:
 
 
 def _lowest_points(robot: Robot, data: pin.Data, index: int, urdf: Path) -> Array:
-    """Return world points on the undersides of the boxes, cylinders and balls that move with a frame."""
-    joint, root = robot.model.frames[index].parentJoint, ET.parse(urdf).getroot()
+    """Return world points on the undersides of the boxes, cylinders and balls that move with a frame.
+
+    The meshes of an MJCF are already loaded, so their corners are among the points.
+    """
+    joint = robot.model.frames[index].parentJoint
+    if robot.mjcf is not None:
+        return np.array(list(_geom_points(robot, data, joint))).reshape(-1, 3)
+    root = ET.parse(urdf).getroot()
     for link in root.iter("link"):
         for collision in link.findall("collision"):
             if collision.find("geometry/mesh") is not None:
@@ -82,6 +89,22 @@ def _lowest_points(robot: Robot, data: pin.Data, index: int, urdf: Path) -> Arra
     moving = [shape for shape in shapes.geometryObjects if shape.parentJoint == joint]
     points = [point for shape in moving for point in _bottom(shape.geometry, data.oMi[joint] * shape.placement)]
     return np.array(points).reshape(-1, 3)
+
+
+def _geom_points(robot: Robot, data: pin.Data, joint: int) -> Iterator[Array]:
+    for geom in () if robot.mjcf is None else geoms_of(robot.mjcf.model):
+        frame = robot.model.frames[robot.frame_id(geom.body)]
+        if frame.parentJoint != joint or not geom.solid:
+            continue
+        at = data.oMi[joint] * frame.placement * geom.placement
+        if geom.kind == "mesh":
+            yield from geom.mesh[0] @ at.rotation.T + at.translation
+        elif geom.kind == "capsule":
+            radius, length = geom.sizes
+            for side in (-0.5, 0.5):
+                yield from _bottom(coal.Sphere(radius), at * pin.SE3(np.eye(3), np.array([0.0, 0.0, side * length])))
+        elif geom.kind in ("sphere", "box", "cylinder"):
+            yield from _bottom(getattr(coal, geom.kind.capitalize())(*geom.sizes), at)
 
 
 def _bottom(shape: Any, at: pin.SE3) -> Sequence[Array]:

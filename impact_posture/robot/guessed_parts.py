@@ -12,7 +12,7 @@ import pinocchio as pin
 
 from impact_posture.config.problem_settings import Root
 from impact_posture.errors import PostureError
-from impact_posture.robot.model_joints import joint_range
+from impact_posture.robot.model_joints import is_link, joint_range
 from impact_posture.robot.named_postures import states_with_base
 from impact_posture.robot.robot import Robot
 
@@ -48,8 +48,8 @@ def joints_to(robot: Robot, frame: str) -> list[str]:
 
 
 def _links(robot: Robot, joint: int) -> list[str]:
-    """Return the names of the link frames that move with a joint."""
-    return [str(f.name) for f in robot.model.frames if f.parentJoint == joint and f.type == pin.FrameType.BODY]
+    """Return the names of the links and sites that move with a joint."""
+    return [str(f.name) for f in robot.model.frames if f.parentJoint == joint and is_link(f)]
 
 
 def _leaves(robot: Robot) -> list[int]:
@@ -107,7 +107,7 @@ def tips(robot: Robot, feet: Sequence[str] = ()) -> tuple[str, ...]:
     def rank(frame: pin.Frame) -> tuple[int, int]:
         name, joint = str(frame.name), int(frame.parentJoint)
         depth = -len(chain(robot, joint))
-        if frame.type != pin.FrameType.BODY:
+        if not is_link(frame):
             return 9, depth
         if _SENSOR.search(name) or _WHEEL.search(name) or _ROTOR.search(name):
             return 8, depth

@@ -50,6 +50,11 @@ def is_free_flyer(model: pin.Model) -> bool:
     return bool(model.njoints > 1 and model.joints[1].shortname() == "JointModelFreeFlyer")
 
 
+def is_link(frame: pin.Frame) -> bool:
+    """Return whether a frame is a link of a URDF, or a body or site of an MJCF, and not the frame of a joint."""
+    return bool(frame.type in (pin.FrameType.BODY, pin.FrameType.OP_FRAME))
+
+
 def joint_range(model: pin.Model) -> range:
     """Return the indices of all joints except the universe and the free-flyer."""
     return range(2 if is_free_flyer(model) else 1, model.njoints)

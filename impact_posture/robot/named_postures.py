@@ -8,28 +8,29 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.config.problem_settings import Root
 from impact_posture.errors import SpecError, UrdfError
 from impact_posture.robot.model_joints import joint_index, q_slice, scalar_entries
+from impact_posture.robot.robot_description import RobotDescription
 from impact_posture.robot.robot_spec import RobotSpec
 from impact_posture.system.arrays import Array
 
 
 def named_postures(
-    model: pin.Model, srdf: Path | None, spec: RobotSpec, root: Root, name: str
+    described: RobotDescription, srdf: Path | None, spec: RobotSpec, name: str
 ) -> tuple[dict[str, Array], str]:
     """Return all named postures, shape (nq,) each, and the name of the default posture.
 
-    Postures of ``robot.toml`` (``spec``) replace ``group_state`` tags of the SRDF with the same name.  The limits of
-    the model must be final.
+    Postures of ``robot.toml`` (``spec``) replace keyframes of the MJCF and ``group_state`` tags of the SRDF with the
+    same name.  The limits of the model must be final.
 
     Raises:
         UrdfError: The SRDF cannot be read.
         SpecError: A posture of ``robot.toml`` does not fit the model, or the default posture does not exist.
     """
-    postures = _srdf_postures(model, srdf, spec) | _toml_postures(model, spec, root, name)
+    model, known = described.model, {key: q for key, q in described.postures.items() if key not in spec.postures}
+    postures = known | _srdf_postures(model, srdf, spec) | _toml_postures(described, spec, name)
     default = spec.default_posture or next(iter(postures), "neutral")
-    postures.setdefault("neutral", _neutral(model))
+    postures.setdefault("neutral", _neutral(described))
     if default not in postures:
         fault = f"default_posture '{default}' does not exist"
         raise SpecError(fault, where=name, hint=f"choose one of {', '.join(postures)}")
@@ -58,9 +59,10 @@ def ignored_bases(spec: RobotSpec, srdf: Path | None, default: str) -> tuple[str
     )
 
 
-def _neutral(model: pin.Model) -> Array:
-    """Return the posture with all joints at zero, or at the limit nearest to zero if the limits exclude zero."""
-    return np.asarray(np.clip(pin.neutral(model), model.lowerPositionLimit, model.upperPositionLimit))
+def _neutral(described: RobotDescription) -> Array:
+    """Return the neutral configuration of a file; joints beyond a limit are at this limit."""
+    model = described.model
+    return np.asarray(np.clip(described.neutral, model.lowerPositionLimit, model.upperPositionLimit))
 
 
 def _srdf_postures(model: pin.Model, srdf: Path | None, spec: RobotSpec) -> dict[str, Array]:
@@ -74,11 +76,11 @@ def _srdf_postures(model: pin.Model, srdf: Path | None, spec: RobotSpec) -> dict
     return {name: pin.normalize(model, q) for name, q in states.items() if name not in spec.postures}
 
 
-def _toml_postures(model: pin.Model, spec: RobotSpec, root: Root, name: str) -> dict[str, Array]:
-    result = {}
+def _toml_postures(described: RobotDescription, spec: RobotSpec, name: str) -> dict[str, Array]:
+    model, root, result = described.model, described.root, {}
     for key, posture in spec.postures.items():
         where = f"{name} posture '{key}'"
-        q = _neutral(model)
+        q = _neutral(described)
         if posture.base is not None and spec.model.root != "free-flyer" and root != "free-flyer":
             fault = f"posture '{key}' gives a base pose, but the root is fixed"
             raise SpecError(fault, where=name, hint='remove it, or write root = "free-flyer" in [model]')

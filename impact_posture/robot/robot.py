@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -35,12 +36,27 @@ _ON_LIMIT = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
+class CompiledMjcf:
+    """The MJCF from which a robot was loaded.
+
+    Attributes:
+        model: The ``mujoco.MjModel`` with all joints; treat it as read-only.
+        joints: The ``pin.Model`` with all joints, in the order of ``model``.
+        start: Default posture of all joints, shape (nq,); joints that the robot locks stay here.
+    """
+
+    model: Any
+    joints: pin.Model
+    start: Array
+
+
+@dataclass(frozen=True, eq=False)
 class Robot:
     """A loaded robot.
 
     Attributes:
         name: Name in outputs.
-        source: Path or ``example-robot-data:`` URI of the URDF.
+        source: Path or ``example-robot-data:`` URI of the URDF or MJCF.
         model: Model with armature, limits and locked joints as used; treat it as read-only.
         root: ``free-flyer`` or ``fixed``.
         postures: Named configurations, shape (nq,).
@@ -53,6 +69,8 @@ class Robot:
         stated_armature: Original armature, shape (nv,), if ``joint_model`` has changed ``model.armature``.
         settings: Settings of :func:`~impact_posture.robot.robot_loader.load_robot`; ``None`` if another function made
             the robot.
+        mjcf: The compiled MJCF; ``None`` for a URDF.
+        mimics: Mimicking joint → mimicked joint; their coupling is left out.
     """
 
     name: str
@@ -68,6 +86,8 @@ class Robot:
     joint_model: JointModel = "reflected"
     stated_armature: Array | None = None
     settings: RobotSettings | None = None
+    mjcf: CompiledMjcf | None = None
+    mimics: Mapping[str, str] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return f"Robot({self.name!r}, root={self.root!r}, nq={self.nq}, nv={self.nv}, source={self.source!r})"

@@ -1,4 +1,4 @@
-"""Load a robot by its name or by the path of a URDF."""
+"""Load a robot by its name or by the path of a URDF or MJCF."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.config.checked import checked
-from impact_posture.config.problem_settings import LoadOptions, RobotSettings, Root, Vector3
+from impact_posture.config.problem_settings import LoadOptions, RobotSettings, Vector3
 from impact_posture.config.table_validation import validate
 from impact_posture.errors import (
     InputError,
@@ -28,9 +28,10 @@ from impact_posture.robot.armature import armature_warning, set_armature
 from impact_posture.robot.inertia_checks import check_any_mass, check_mass_matrix, check_moved_mass, massless_joints
 from impact_posture.robot.model_joints import immovable_joints, joint_index, movable_joints, q_slice, v_slice
 from impact_posture.robot.named_postures import ignored_bases, named_postures
-from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot import CompiledMjcf, Robot
+from impact_posture.robot.robot_description import read_description
 from impact_posture.robot.robot_spec import RobotSpec, read_spec
-from impact_posture.robot.urdf import EXAMPLE_PREFIX, build_model, example_models, resolve_path, robots_data
+from impact_posture.robot.urdf import EXAMPLE_PREFIX, example_models, resolve_path, robots_data
 from impact_posture.system.arrays import Array
 
 
@@ -41,7 +42,7 @@ def known_robots() -> tuple[str, ...]:
 
 @checked
 def load_robot(robot: str, options: LoadOptions | None = None, **settings: Any) -> Robot:
-    """Load a robot by known name, by path to a ``.urdf``, or by ``example-robot-data:<path below robots/>``.
+    """Load a robot by known name, path to a URDF or MJCF, or ``example-robot-data:<path below robots/>``.
 
     Args:
         robot: Name, path or URI.
@@ -60,25 +61,24 @@ def load_robot(robot: str, options: LoadOptions | None = None, **settings: Any) 
 
 
 def build_robot(located: Located, options: LoadOptions) -> Robot:
-    """Build the robot that a URDF and a ``robot.toml`` describe; see :func:`load_robot` for errors."""
+    """Build the robot that a URDF or MJCF and a ``robot.toml`` describe; see :func:`load_robot` for errors."""
     spec, urdf, source, base, name = located
-    root: Root = options.root or spec.model.root
     _check_package_dirs(options.package_dir, Path(), "package_dir")
     _check_package_dirs(spec.model.package_dirs, base, f"{name} robot.toml [model] package_dirs")
-    model, warnings, mimics = build_model(
-        urdf, free_flyer=root == "free-flyer", accept_inertias=spec.model.accept_inertias
-    )
+    described = read_description(urdf, options.root or spec.model.root, accept_inertias=spec.model.accept_inertias)
+    model, root, mimics, warnings = described.model, described.root, described.mimics, described.warnings
     _remount(model, options.mounting, name)
     srdf = srdf_path(spec, options, base)
     _override_limits(model, spec, name)
     _check_limits(model, source)
-    postures, default = named_postures(model, srdf, spec, root, name)
+    postures, default = named_postures(described, srdf, spec, name)
     armature_source = set_armature(model, spec, srdf, options.armature, name)
     check_any_mass(model, source)
     locked = _named(model, (*spec.model.lock, *options.lock), f"{name} lock")
     if spec.model.lock_massless or options.lock_massless:
         massless = (joint for joint in massless_joints(model) if joint != "root_joint")
         locked = tuple(dict.fromkeys((*locked, *massless)))
+    mjcf = None if described.mjcf is None else CompiledMjcf(described.mjcf, model, postures[default])
     if locked:
         model, postures = _lock(model, locked, postures, default, name)
     check_moved_mass(model, source)
@@ -91,7 +91,7 @@ def build_robot(located: Located, options: LoadOptions) -> Robot:
     warnings = (*warnings, *armature_warning(model, armature_source, spec.constraints.hold))
     loaded = Robot(
         name=name, source=source, model=model, root=root, postures=postures, default_posture=default, spec=spec,
-        locked=locked, armature_source=armature_source, warnings=warnings,
+        locked=locked, armature_source=armature_source, warnings=warnings, mjcf=mjcf, mimics=mimics,
     )  # fmt: skip
     check_mass_matrix(loaded, source)
     return loaded
@@ -164,7 +164,7 @@ def locate(robot: str, options: LoadOptions) -> Located:
         urdf, source = Path(robot).expanduser(), robot
     else:
         similar = [EXAMPLE_PREFIX + p for p in example_models() if robot.casefold() in Path(p).stem.casefold()]
-        raise RobotNotFound(robot, [*known_robots(), *similar], hint="(or give a path to a .urdf)")
+        raise RobotNotFound(robot, [*known_robots(), *similar], hint="(or give a path to a .urdf or an MJCF)")
     config = Path(options.config) if options.config else urdf.parent / "robot.toml"
     if options.config or (os.path.isfile(config) and EXAMPLE_PREFIX not in source):
         spec, base = read_spec(config), config.parent

@@ -25,7 +25,8 @@ class ModelSpec(_Table):
 
     urdf: str | None = None
     srdf: str | None = None
-    root: Root = "fixed"
+    # ``None`` keeps the root of an MJCF, and means ``fixed`` for a URDF.
+    root: Root | None = None
     package_dirs: tuple[str, ...] = ()
     lock: tuple[str, ...] = ()
     lock_massless: bool = False

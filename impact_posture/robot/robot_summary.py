@@ -10,7 +10,7 @@ import pinocchio as pin
 from impact_posture.config.json_block import jsonable
 from impact_posture.errors import ImpactPostureError
 from impact_posture.robot.actuation import allocation, hover, lateral_force_range, thrust_limits
-from impact_posture.robot.model_joints import ENDLESS, joint_family
+from impact_posture.robot.model_joints import ENDLESS, is_link, joint_family
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import known_robots
 from impact_posture.robot.robot_spec import PropulsionSpec, read_spec
@@ -18,7 +18,7 @@ from impact_posture.robot.urdf import EXAMPLE_PREFIX, robots_data
 
 WAYS_TO_NAME = (
     "a known name, as listed",
-    "a path to a .urdf; a robot.toml beside it, or --config, adds data that a URDF cannot hold",
+    "a path to a URDF, or to an MJCF (.xml); a robot.toml beside it, or --config, adds data that the file lacks",
     f"{EXAMPLE_PREFIX}<path below its robots/ folder>",
 )
 
@@ -35,7 +35,7 @@ def catalogue() -> list[dict[str, Any]]:
                 "name": name,
                 "kind": spec.kind,
                 "description": spec.description,
-                "root": spec.model.root,
+                "root": spec.model.root or "fixed",
                 "frame": spec.contact.frame,
                 "supports": [support.frame for support in spec.supports],
                 "urdf": f"impact-posture:{name}/{urdf}" if shipped else urdf,
@@ -105,7 +105,7 @@ def _frames(robot: Robot) -> list[dict[str, Any]]:
         {
             "name": str(frame.name),
             "joint": str(robot.model.names[frame.parentJoint]),
-            "link": frame.type == pin.FrameType.BODY,
+            "link": is_link(frame),
         }
         for frame in frames
     ]

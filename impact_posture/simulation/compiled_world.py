@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from impact_posture.dynamics.mjcf import import_mujoco, unwarned
 from impact_posture.errors import CompilerError
 from impact_posture.simulation.controllers.compiled_tick import CompiledTick
 from impact_posture.simulation.scenario_objective import locked
@@ -27,6 +26,7 @@ from impact_posture.system.libraries import (
     load_library,
     source_key,
 )
+from impact_posture.system.optional_package import import_mujoco, unwarned
 
 _NAME = "world_ticks"
 # Maximum number of propellers in the C loop, the same as ``ROTORS`` in ``world_ticks.c``.

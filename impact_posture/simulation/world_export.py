@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from impact_posture.dynamics.mjcf import import_mujoco
 from impact_posture.errors import InputError
 from impact_posture.impact.impact_contact import point_on
 from impact_posture.simulation.controllers.contact_reference import Reference
@@ -23,6 +22,7 @@ from impact_posture.simulation.run import BRACE
 from impact_posture.simulation.scenario_file import RepeatedContacts, SinglePush
 from impact_posture.simulation.setup import Setup
 from impact_posture.simulation.world.throw import Throw
+from impact_posture.system.optional_package import import_mujoco
 from impact_posture.system.output_folder import whole_folder
 
 MODEL, PARAMETERS = "world.mjb", "world.txt"

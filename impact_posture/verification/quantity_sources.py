@@ -160,9 +160,9 @@ class MujocoSource:
 
     def __init__(self, objective: WorstCaseObjective) -> None:
         self._objective = objective
-        model = objective.robot.model.copy()
-        model.armature, self._locked = finite_armature(model)
-        self._numeric = MujocoNumeric(model)
+        _, self._locked = finite_armature(objective.robot.model)
+        frames = [contact.frame for contact in objective.contacts] + [foot.frame for foot in objective.supports]
+        self._numeric = MujocoNumeric(objective.robot, frames)
 
     def __call__(self, sample: PostureSample) -> Numbers:
         """Return the quantities at one sample.  ``∇H`` is computed by finite differences of ``H``."""

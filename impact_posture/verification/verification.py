@@ -13,10 +13,10 @@ import numpy as np
 from impact_posture.codegen.compile_and_check import Deviation, deviation
 from impact_posture.config.checked import checked
 from impact_posture.config.demand import OneOrMore, ZeroOrMore
-from impact_posture.dynamics.mjcf import import_mujoco
 from impact_posture.errors import InputError
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.robot import Robot
+from impact_posture.system.optional_package import import_mujoco
 from impact_posture.system.toolchain import GET_ONE, find_compiler
 from impact_posture.verification.quantity_sources import (
     MujocoSource,

@@ -102,7 +102,7 @@ def test_a_changed_input_runs_the_job_again(
     posture.write_text(json.dumps({"q": q.tolist()}))
     mesh.write_text("v 0 0 0")
     shape = UrdfShape("ball", "base_link", pin.SE3.Identity(), "mesh", (1.0, 1.0, 1.0), mesh)
-    monkeypatch.setattr(job_store, "read_urdf_shapes", lambda robot: ([shape], []))
+    monkeypatch.setattr(job_store, "read_shapes", lambda robot: ([shape], []))
     job = Job(str(path), "nominal")
     store.keep(job, {"metrics": {}})
     assert store.find(job) == {"metrics": {}} and store.find(replace(job, gain=3.0)) is None

@@ -10,13 +10,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from impact_posture.dynamics.mjcf import build_mjcf, import_mujoco
+from impact_posture.dynamics.mjcf import build_mjcf
 from impact_posture.impact.evaluation.coulomb_jump import coulomb_jump, coulomb_jumps
 from impact_posture.impact.friction.contact_impulses import contact_impulses
 from impact_posture.impact.friction.coulomb_impact import coulomb_impact
 from impact_posture.impact.impact_contact import ImpactContact, point_on
 from impact_posture.impact.metric import Metric
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.system.optional_package import import_mujoco
 from tests.support.helpers import Vector, assert_close, random_configurations, rng, robot, unit
 
 FEET = ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT")

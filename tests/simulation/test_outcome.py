@@ -10,7 +10,6 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from impact_posture.dynamics.mjcf import import_mujoco
 from impact_posture.errors import SpecError
 from impact_posture.simulation.metrics import measure
 from impact_posture.simulation.outcome import Event, doubts, judge, links_behind
@@ -19,6 +18,7 @@ from impact_posture.simulation.run import Run
 from impact_posture.simulation.scenario_file import Bounds, read_scenario
 from impact_posture.simulation.series import Window
 from impact_posture.simulation.setup import Setup, set_up
+from impact_posture.system.optional_package import import_mujoco
 from impact_posture.tsid.controller import Status
 from tests.simulation.factories import (
     SHIPPED,

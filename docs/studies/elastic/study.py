@@ -13,7 +13,6 @@ import numpy as np
 from docs.studies.core import Request, machine, say, table
 from docs.studies.elastic.figure import draw
 from docs.studies.elastic.world import ElasticWorld, Measured
-from impact_posture.dynamics.mjcf import import_mujoco
 from impact_posture.impact.elasticity.elastic_impact import ElasticImpact
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.impact_contact import ImpactContact
@@ -22,6 +21,7 @@ from impact_posture.robot.joint_model import with_joint_model
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.robot.robot_spec import JointTransmissionSpec, TransmissionSpec
+from impact_posture.system.optional_package import import_mujoco
 from tests.support.arms import TIP, seven_joints
 from tests.support.helpers import rng, unit
 

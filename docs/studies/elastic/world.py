@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from docs.studies.core import Vector
-from impact_posture.dynamics.mjcf import build_mjcf, import_mujoco, pose
+from impact_posture.dynamics.mjcf import build_mjcf, pose
 from impact_posture.impact.elasticity.elastic_impact import ElasticImpact
+from impact_posture.system.optional_package import import_mujoco
 
 # Mass (kg) and moments of inertia (kg m²) of the body of a rotor.  They are negligible, because the armature of the
 # rotor joint contains the inertia of the rotor.

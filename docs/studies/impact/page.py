@@ -25,8 +25,8 @@ from docs.studies.impact.study import (
     needed_friction,
 )
 from docs.studies.impact.surface import Surface
-from impact_posture.dynamics.mjcf import import_mujoco
 from impact_posture.errors import ImpactPostureError, InputError
+from impact_posture.system.optional_package import import_mujoco
 
 # Number of postures of each robot in the table of variations.
 _FEW = 10

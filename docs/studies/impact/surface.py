@@ -9,11 +9,12 @@ import numpy as np
 import pinocchio as pin
 
 from docs.studies.core import Vector
-from impact_posture.dynamics.mjcf import Mjcf, build_mjcf, import_mujoco, pose
+from impact_posture.dynamics.mjcf import Mjcf, build_mjcf, pose
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.impact.friction.coulomb_impact import coulomb_impact
 from impact_posture.impact.impact_contact import point_on
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.system.optional_package import import_mujoco
 
 # Number of simulation steps in one time constant of the contact, and number of time constants after which the study
 # stops waiting for the end of the contact.

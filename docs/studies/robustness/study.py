@@ -14,8 +14,8 @@ from docs.studies.core import ROOT, Request, machine, say
 from docs.studies.robustness import envelope, page
 from docs.studies.robustness.outcomes import NotAdmissible, Record, is_complete, point
 from docs.studies.robustness.variations import RANGES, VARIATIONS
-from impact_posture.dynamics.mjcf import import_mujoco
 from impact_posture.posture.program.ipopt import one_blas_thread
+from impact_posture.system.optional_package import import_mujoco
 from impact_posture.system.processes import fork_map
 
 

@@ -13,9 +13,9 @@ import numpy as np
 import pinocchio as pin
 from pydantic import PlainSerializer, PlainValidator
 
-from impact_posture.collision.coal_geometry import geometry_key, load_geometry
+from impact_posture.collision.coal_geometry import geometry_key, load_geometry, read_shapes
 from impact_posture.collision.shape_corners import Triangles, hull_surface, shape_points, surface_of
-from impact_posture.collision.urdf_shapes import UrdfShape, read_urdf_shapes
+from impact_posture.collision.urdf_shapes import UrdfShape
 from impact_posture.config.cached_values import StoredArray, read_stored, write_stored
 from impact_posture.errors import PackageNotFound
 from impact_posture.output.plot.skeleton import link_tip
@@ -128,9 +128,9 @@ def draw_robot(robot: Robot, meshes: bool = False) -> DrawnRobot:
 
     A robot without shapes gets sticks.  If ``meshes`` is true, the user permits copies of all meshes.
     """
-    described, warnings, _ = read_urdf_shapes(robot, "visual")
+    described, warnings, _ = read_shapes(robot, "visual")
     by_name = {shape.name: shape for shape in described}
-    known = {shape.name: license_of(shape.mesh) for shape in described if shape.mesh is not None}
+    known = {shape.name: license_of(shape.mesh) for shape in described if shape.kind == "mesh"}
     hulls = {name for name, terms in known.items() if not (meshes or (terms and terms.allows))}
     key = source_key([geometry_key(robot, described), repr(sorted(hulls))], "report")
     placed = read_stored("solids", key, PlacedSolids)
@@ -159,7 +159,7 @@ def _placed_solids(robot: Robot, described: list[UrdfShape], hulls: set[str]) ->
     for placed in loaded.model.geometryObjects:
         shape, hull = by_name[placed.name], placed.name in hulls
         # Shapes with the same file and scale share a mesh.
-        key = (shape.kind, shape.sizes, shape.mesh, hull)
+        key = (shape.key, hull)
         if key not in solids:
             solids[key] = hull_of(shape_points(placed.geometry)) if hull else _quantized(*surface_of(placed.geometry))
         places.append((placed.name, int(placed.parentJoint), list(solids).index(key), placed.placement))
@@ -234,8 +234,10 @@ def _color(shape: UrdfShape) -> Color:
     return (*np.clip(color, _DARKEST, 1.0).tolist(), opacity)
 
 
-def license_of(mesh: Path) -> MeshLicense | None:
+def license_of(mesh: Path | None) -> MeshLicense | None:
     """Return the license of a mesh in example-robot-data; ``None`` for other meshes."""
+    if mesh is None:
+        return None
     try:
         root = example_robot_data().resolve()
     except PackageNotFound:

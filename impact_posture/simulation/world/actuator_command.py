@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from impact_posture.config.problem_settings import Vector3
-from impact_posture.dynamics.mjcf import import_mujoco
 from impact_posture.errors import InputError
 from impact_posture.robot.robot import Robot
 from impact_posture.simulation.world.contact_forces import ShapeTruth
 from impact_posture.simulation.world.rotors import Rotors
 from impact_posture.system.arrays import Array
+from impact_posture.system.optional_package import import_mujoco
 from impact_posture.tsid.controller import Command
 
 # A larger position (m), speed (m/s, rad/s) or torque (N·m) means that the state has diverged.

@@ -10,11 +10,12 @@ import numpy as np
 from impact_posture.config.checked import checked
 from impact_posture.config.demand import Demand, Direction, NonNegative, Positive
 from impact_posture.config.table_validation import StrictTable
-from impact_posture.dynamics.mjcf import Mjcf, import_mujoco
+from impact_posture.dynamics.mjcf import Mjcf
 from impact_posture.impact.quantities.impact_oracle import ImpactOracle
 from impact_posture.simulation.world.contact_law import ContactLaw
 from impact_posture.system.arrays import Array
 from impact_posture.system.escape import xml_name
+from impact_posture.system.optional_package import import_mujoco
 
 # Time from the launch until the ball touches a shape at rest, s.  In this short time, gravity deflects the ball by
 # less than a millimeter.

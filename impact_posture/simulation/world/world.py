@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from impact_posture.dynamics.mjcf import import_mujoco, unwarned
 from impact_posture.errors import InputError, SimulationDiverged
 from impact_posture.impact.impact_contact import point_on
 from impact_posture.robot.actuation import hover
@@ -31,6 +30,7 @@ from impact_posture.simulation.world.sensor_noise import NO_FORCE, ForceFilter, 
 from impact_posture.simulation.world.throw import Ball, Throw
 from impact_posture.simulation.world.world_builder import BuiltScene, build_scene
 from impact_posture.system.arrays import Array
+from impact_posture.system.optional_package import import_mujoco, unwarned
 from impact_posture.tsid.controller import Command
 from impact_posture.tsid.state import checked_velocity
 

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from impact_posture.collision.coal_geometry import read_shapes
 from impact_posture.collision.shape_corners import shape_points
-from impact_posture.collision.urdf_shapes import UnusableShape, largest_extent, read_urdf_shapes
+from impact_posture.collision.urdf_shapes import UnusableShape, largest_extent
 from impact_posture.dynamics.chart import Chart
-from impact_posture.dynamics.mjcf import Mjcf, build_mjcf, import_mujoco
+from impact_posture.dynamics.mjcf import Mjcf, build_mjcf
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import InputError, UnsupportedJoint
 from impact_posture.impact.impact_contact import point_on
@@ -24,6 +25,7 @@ from impact_posture.simulation.world.scene import Physics, Scene, Shape, Surface
 from impact_posture.simulation.world.throw import BALL, Throw, add_ball
 from impact_posture.system.arrays import Array
 from impact_posture.system.escape import xml_name
+from impact_posture.system.optional_package import import_mujoco
 
 # Joint families whose velocities have the same meaning in Pinocchio and MuJoCo.
 _DRIVEN = ("revolute", "continuous", "prismatic", "translation", "spherical")
@@ -107,7 +109,7 @@ def _add_rotor_link(mjcf: Mjcf, robot: Robot) -> tuple[list[str], Array]:
     of a shape touches a surface where the shape does.
     """
     propulsion, names, points = robot.spec.propulsion, [], [np.zeros((0, 3))]
-    shapes = [] if propulsion is None else read_urdf_shapes(robot)[0]
+    shapes = [] if propulsion is None else read_shapes(robot)[0]
     for shape in (shape for shape in shapes if propulsion is not None and shape.link == propulsion.frame):
         # Skip shapes that cannot be used.  The warnings of the robot already name them.
         with suppress(UnusableShape):

@@ -1,0 +1,220 @@
+"""Compile an MJCF with the compiler of MuJoCo, and refuse what a model without coupled joints cannot contain."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from impact_posture.config.problem_settings import Root
+from impact_posture.errors import MjcfError
+from impact_posture.robot.urdf import MOST_DEGREES_OF_FREEDOM
+from impact_posture.system.arrays import Array
+from impact_posture.system.optional_package import import_mujoco, unwarned
+
+_STATED, _FROM_GEOMS = "in a copy of the file", 1
+
+
+class MjcfFile(NamedTuple):
+    """A compiled MJCF.
+
+    Attributes:
+        model: The ``mujoco.MjModel`` on the chosen root.
+        root: ``free-flyer`` if the model has a free joint, else ``fixed``.
+        keyframes: Name of a keyframe → name of a joint → its entries in ``qpos``.
+        couplings: Joint → joint on which an equality constraint makes it depend.
+        notes: Warnings about content that has no effect here, one line each.
+    """
+
+    model: Any
+    root: Root
+    keyframes: dict[str, dict[str, Array]]
+    couplings: dict[str, str]
+    notes: tuple[str, ...]
+
+
+def is_mjcf(path: Path) -> bool:
+    """Return whether the root element of a file is ``<mujoco>``; ``False`` for an unreadable file."""
+    try:
+        with path.open("rb") as file:
+            return bool(next(ET.iterparse(file, ("start",)))[1].tag == "mujoco")
+    except (OSError, ValueError, ET.ParseError, StopIteration):
+        return False
+
+
+def read_mjcf(path: Path, root: Root | None) -> MjcfFile:
+    """Compile an MJCF.  ``root`` adds or removes the free joint; ``None`` keeps the root of the file.
+
+    Raises:
+        MjcfError: MuJoCo rejects the file, or the file couples joints by loops or tendons.
+        InputError: MuJoCo is not installed.
+    """
+    mujoco = import_mujoco()
+    with unwarned():
+        try:
+            spec = mujoco.MjSpec.from_file(str(path))
+            spec.compiler.fusestatic = False
+            model, notes = _compile(spec, path)
+            keyframes = _keyframes(model)
+            free = [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]
+            if root is not None and (root == "free-flyer") != bool(free):
+                model = _rerooted(spec, free, path)
+        except (ValueError, UnicodeError, mujoco.FatalError) as error:
+            hint = "correct the file, or try it in MuJoCo's `simulate`"
+            raise MjcfError(f"MuJoCo refuses it ({error})", where=str(path), hint=hint) from None
+    _check_tree(model, path)
+    couplings = _couplings(model, path)
+    floating: Root = "free-flyer" if is_floating(model) else "fixed"
+    return MjcfFile(model, floating, keyframes, couplings, (*notes, *_left_out(model)))
+
+
+def object_name(model: Any, kind: str, index: int) -> str:
+    """Return the name of a MuJoCo object, or its ``kind`` (``body``, ``joint``, …) and index if it has no name."""
+    return getattr(model, kind)(index).name or f"{kind}{index}"
+
+
+def drives_joint(model: Any, actuator: int) -> bool:
+    """Return whether an actuator acts on one joint, not on a tendon, a site or a body."""
+    kind, types = model.actuator_trntype[actuator], import_mujoco().mjtTrn
+    return bool(kind == types.mjTRN_JOINT or kind == types.mjTRN_JOINTINPARENT)
+
+
+def _compile(spec: Any, path: Path) -> tuple[Any, list[str]]:
+    """Compile a spec without textures, and without missing meshes if all inertias are stated."""
+    for texture in spec.textures:
+        texture.file, texture.cubefiles = "", [""] * 6
+        texture.builtin, texture.width, texture.height = import_mujoco().mjtBuiltin.mjBUILTIN_FLAT, 1, 1
+    missing = {mesh.name: mesh.file for mesh in spec.meshes if mesh.file and not _asset(spec, mesh).is_file()}
+    missing |= {field.name: field.file for field in spec.hfields if field.file and not _asset(spec, field).is_file()}
+    try:
+        return spec.compile(), []
+    except ValueError:
+        if not missing:
+            raise
+    for geom in list(spec.geoms):
+        file = missing.get(geom.meshname) or missing.get(geom.hfieldname)
+        if file is None:
+            continue
+        body = geom.parent
+        if body.name != "world" and not (body.explicitinertial and spec.compiler.inertiafromgeom != _FROM_GEOMS):
+            fault = f"no mesh '{file}', and body '{body.name}' takes its inertia from it"
+            raise MjcfError(fault, where=str(path), hint="add the mesh, or state <inertial>")
+        spec.delete(geom)
+    for asset in (*list(spec.meshes), *list(spec.hfields)):
+        if asset.name in missing:
+            spec.delete(asset)
+    for skin in list(spec.skins):
+        spec.delete(skin)
+    files = sorted(missing.values())
+    more = f" and {len(files) - 1} more" if files[1:] else ""
+    return spec.compile(), [f"no mesh '{files[0]}'{more}: their shapes are left out; inertias are stated"]
+
+
+def _asset(spec: Any, asset: Any) -> Path:
+    name = Path(asset.file).name if spec.strippath else asset.file
+    return Path(spec.modelfiledir, (asset.compiler or spec.compiler).meshdir, name)
+
+
+def _keyframes(model: Any) -> dict[str, dict[str, Array]]:
+    ends = np.append(model.jnt_qposadr, model.nq)
+    joints = {object_name(model, "joint", j): slice(ends[j], ends[j + 1]) for j in range(model.njnt)}
+    return {
+        object_name(model, "key", k): {name: np.array(model.key_qpos[k][at]) for name, at in joints.items()}
+        for k in range(model.nkey)
+    }
+
+
+def _rerooted(spec: Any, free: list[Any], path: Path) -> Any:
+    """Compile a spec without its free joints, or with a free joint at its only body on the world."""
+    if free:
+        for joint in free:
+            spec.delete(joint)
+    else:
+        bodies = list(spec.worldbody.bodies)
+        if len(bodies) != 1 or list(bodies[0].joints):
+            fault = f"root free-flyer needs one body on the world that does not move, not {len(bodies)}"
+            if len(bodies) == 1:
+                fault = f"root free-flyer does not fit, because joints move body '{bodies[0].name}' in the world"
+            raise MjcfError(fault, where=str(path), hint="leave `root` out, or write a <freejoint/> into the file")
+        bodies[0].add_freejoint()
+    for key in list(spec.keys):
+        spec.delete(key)
+    return spec.compile()
+
+
+def is_floating(model: Any) -> bool:
+    """Return whether the first joint of an ``MjModel`` is free."""
+    return bool(model.njnt and model.jnt_type[0] == import_mujoco().mjtJoint.mjJNT_FREE)
+
+
+def _check_tree(model: Any, path: Path) -> None:
+    """Raise an error for models without joints, with flexible bodies, or with several floating bodies."""
+    if not model.nv:
+        raise MjcfError("has no movable joint", where=str(path), hint="use `root` free-flyer or another file")
+    if model.nv > MOST_DEGREES_OF_FREEDOM:
+        fault = f"has {model.nv} degrees of freedom, more than the supported {MOST_DEGREES_OF_FREEDOM}"
+        raise MjcfError(fault, where=str(path), hint=f"remove the joints that hardly matter {_STATED}")
+    if model.nflex:
+        raise MjcfError("has flexible bodies", where=str(path), hint=f"remove the <flexcomp> {_STATED}")
+    free = np.flatnonzero(model.jnt_type == import_mujoco().mjtJoint.mjJNT_FREE)
+    if free.size and (free.size > 1 or free[0]):
+        other = object_name(model, "body", int(model.jnt_bodyid[free[-1]]))
+        fault = f"body '{other}' floats beside the robot"
+        raise MjcfError(
+            fault, where=str(path), hint=f"remove this body {_STATED}, or name the robot without its scene"
+        )
+
+
+def _couplings(model: Any, path: Path) -> dict[str, str]:
+    """Return the joints coupled by equality constraints; raise an error for loops and for tendons that couple joints.
+
+    A joint that an equality constraint holds at a constant depends on itself.
+    """
+    mujoco, couplings = import_mujoco(), dict[str, str]()
+    for k in np.flatnonzero(model.eq_active0):
+        kind = mujoco.mjtEq(int(model.eq_type[k])).name.removeprefix("mjEQ_").lower()
+        first, second = int(model.eq_obj1id[k]), int(model.eq_obj2id[k])
+        if kind == "joint":
+            name = object_name(model, "joint", first)
+            couplings[name] = object_name(model, "joint", second) if second >= 0 else name
+            continue
+        name = object_name(model, "equality", int(k))
+        what = "couples joints by tendons" if kind == "tendon" else "closes a kinematic loop"
+        hint = f"remove it {_STATED}, if the impact can do without, and `lock` or hold the joints that it guides"
+        raise MjcfError(f"equality '{name}' ({kind}) {what}, which is not supported", where=str(path), hint=hint)
+    for name in _coupling_armatures(model):
+        hint = f"remove its armature {_STATED}, or move it to the joints"
+        raise MjcfError(f"the armature of {name} couples joints", where=str(path), hint=hint)
+    return couplings
+
+
+def _coupling_armatures(model: Any) -> Iterator[str]:
+    types = import_mujoco().mjtJoint
+    for t in np.flatnonzero(model.tendon_armature):
+        yield f"tendon '{object_name(model, 'tendon', int(t))}'"
+    for a in np.flatnonzero(model.actuator_armature):
+        kind = model.jnt_type[model.actuator_trnid[a, 0]] if drives_joint(model, int(a)) else None
+        if not (kind == types.mjJNT_SLIDE or kind == types.mjJNT_HINGE):
+            yield f"actuator '{object_name(model, 'actuator', int(a))}'"
+
+
+def _left_out(model: Any) -> Iterator[str]:
+    """Yield a line about everything in the file that the model of an impact does not contain."""
+    mujoco = import_mujoco()
+    balls = (model.jnt_type == mujoco.mjtJoint.mjJNT_BALL) & (model.jnt_limited > 0)
+    tendons = (model.tendon_stiffness > 0) | (model.tendon_limited > 0) | (model.tendon_damping > 0)
+    counts = {
+        "damping": np.count_nonzero(model.dof_damping),
+        "friction loss": np.count_nonzero(model.dof_frictionloss),
+        "springs": np.count_nonzero(model.jnt_stiffness),
+        "limits of ball joints": np.count_nonzero(balls),
+        "limits and springs of tendons": np.count_nonzero(tendons),
+        "gravity compensation": np.count_nonzero(model.body_gravcomp),
+        "geoms of the world": int(model.body_geomnum[0]) * is_floating(model),
+    }
+    parts = [f"{what} ({count})" for what, count in counts.items() if count]
+    if parts:
+        yield f"these parts of the MJCF have no effect here: {', '.join(parts)}"
