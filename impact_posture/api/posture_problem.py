@@ -31,9 +31,8 @@ class PostureProblem:
 
     Args:
         objective: An :class:`ImpactObjective`, or another implementation of
-            :class:`~impact_posture.impact.objective.Objective`.  If the objective has no ``kind`` and the speed, the
-            friction or the elasticity of the contact is stated, the minimized quantity is chosen as by
-            ``--objective auto`` on the command line.
+            :class:`~impact_posture.impact.objective.Objective`.  An objective without ``kind`` gets its kind as by
+            ``--objective auto`` on the command line, if speed, friction or elasticity of the contact are stated.
         posture: Start of the search: the name of a posture, a file, or a configuration of shape (nq,); ``None``
             selects the default posture.
         speed: Approach speed of the predicted impact, m/s.

@@ -242,9 +242,9 @@ def optimize(
 
     Args:
         problem: The problem.
-        starts: Most random postures that the search screens, by default 1024; for the search ``multistart`` and for
-            problems that cannot be screened, the number of starts, by default 16, of which the first is the given
-            posture and the others are random feasible postures.
+        starts: Most random postures that the search screens, by default 1024.  For the search ``multistart`` and for
+            problems that cannot be screened, the number of starts, by default 16.  Then the first start is the given
+            posture, and the others are random feasible postures.
         seed: Seed of the random starts.
         jobs: Number of parallel processes.
         compile: When to compile the program: ``auto`` (if it saves time), ``always`` or ``never``.

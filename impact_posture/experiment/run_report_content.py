@@ -133,7 +133,7 @@ def comparison_content(folder: Path, document: Document, view: RunView) -> Conte
         facts=tuple(run_header([view])[1]),
         verdict=(*lines, *(f"{row['controller']}: {reason}" for row in rows for reason in row["failed"])),
         tables=(Table(means, ("", *labels, "unit", "meaning"), tuple(table)),),
-        moves=f"{_MOVES} The runs are those of the first seed.",
+        moves=f"{_MOVES} The runs have the first seed.",
         notes=(),
     )
 

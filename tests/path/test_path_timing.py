@@ -101,7 +101,7 @@ def test_limits_hold_at_the_rows_and_between_them(
     if not base:
         # A timed path is as fast as possible if it reaches a limit at all times.
         assert max(largest, fastest) > 0.98
-        # The shares in the files are those between the rows, too.
+        # The files also contain the shares between the rows.
         assert path.use is not None and path.use.largest["torque"] == pytest.approx(largest, abs=2e-3)
 
 

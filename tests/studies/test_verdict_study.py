@@ -94,7 +94,7 @@ def test_a_standing_box_tips_about_an_edge() -> None:
     least = MASS * gravity * HALF / height
     assert result.force == pytest.approx(least + speed * np.sqrt(STIFF * mass), rel=5e-3)
     assert result.jump[4] == pytest.approx(speed / height, rel=5e-3)
-    # The first two corners are those that lift.
+    # Only the first two corners lift.
     assert result.up == pytest.approx([2 * HALF * speed / height] * 2 + [0.0, 0.0], rel=1e-2, abs=1e-4)
     assert result.feet[2:] == pytest.approx(0.0, abs=1e-4)
 

@@ -224,7 +224,7 @@ def _carried(upward: Vector, weight: Vector) -> tuple[Vector, bool]:
         return np.zeros(upward.shape[1]), True
     forces = np.linalg.lstsq(upward, weight, rcond=1e-9)[0]
     if forces.min() < 0:
-        # A small weight on the forces themselves selects those with the least sum of squares.
+        # A small weight on the forces selects the solution with the least sum of squares.
         least = 1e-5 * np.eye(upward.shape[1])
         forces = scipy.optimize.nnls(np.vstack([upward, least]), np.append(weight, np.zeros(len(least))))[0]
     return forces, bool(np.linalg.norm(upward @ forces - weight) <= _STANDS * np.linalg.norm(weight))

@@ -73,8 +73,8 @@ static void ip_flow_back(ip_context *c, double period, double *back)
   ip_add(back, 1.0, f->returning, IP_NV);
 }
 
-/* Return the time in which the new velocity covers the distance of the change and of the braking.  The assumed
- * deceleration is the one that the actuators permitted in the last changes. */
+/* Return the time in which the new velocity covers the distance of the change and of the braking, at the deceleration
+ * that the actuators permitted in the last changes. */
 static double ip_flow_braking(const ip_flow *f, const ip_params *p, const double *step, double period)
 {
   double after[IP_NV];

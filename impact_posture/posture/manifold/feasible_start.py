@@ -141,8 +141,8 @@ def feasible_start(
 
     Start 0 is the given posture, projected onto the constraints.  Odd starts lie near the posture ``around``, by
     default the given one.  Even starts lie anywhere within the limits.  Near starts reach the constraints more often;
-    far starts lead to other optima.  Of ``candidates`` projected postures, the start is the one that violates the
-    other constraints least.  ``projector`` may belong to the same problem with fewer parts in its program.
+    far starts lead to other optima.  A start is the one of ``candidates`` projected postures that violates the other
+    constraints least.  ``projector`` may belong to the same problem with fewer parts in its program.
     """
     if index == 0:
         projection = (projector or Projector(problem)).project(problem.given)

@@ -50,9 +50,9 @@ class Shape(StrictTable):
         size: Radius of a sphere, or three half extents of a box, m.
         kind: ``sphere``, or ``box`` with its edges along the axes of the frame.
         offset: Contact point in the coordinates of the frame, m.
-        center: Center of the shape in the coordinates of the frame, m.  By default, the center is placed so that, in
-            the start posture, ``offset`` is the point of the sphere that is nearest to the first surface, or the
-            middle of the nearest face of the box.
+        center: Center of the shape in the coordinates of the frame, m.  By default, ``offset`` is the
+            point of the sphere, or the middle of the face of the box, that is nearest to the first surface in the
+            start posture.
     """
 
     frame: str
