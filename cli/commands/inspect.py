@@ -62,7 +62,7 @@ def inspect(
 
 
 def _write(page: Page, robot: str, load: LoadOptions, out: str, *, force: bool) -> None:
-    from impact_posture.robot.draft import write_draft
+    from impact_posture.draft.draft import write_draft
 
     path, draft = write_draft(robot, load, Path(out) if out else None, force=force)
     if page.json:

@@ -18,7 +18,8 @@ from impact_posture.config.cached_values import StoredArray, read_stored, write_
 from impact_posture.config.demand import Vector3
 from impact_posture.robot.model_joints import rigid_groups
 from impact_posture.robot.robot import Robot
-from impact_posture.system.arrays import Array, nonnegative_least_squares
+from impact_posture.robot.support_polygon import nearest_in_hull
+from impact_posture.system.arrays import Array
 
 # Points less than this (m) behind the foremost point belong to the same flat front.
 _FLAT = 5e-4
@@ -108,7 +109,7 @@ def contact_front(
         in_world: Whether the direction is in world axes instead of the axes of the frame.
     """
     carrier = robot.model.frames[robot.frame_id(frame)]
-    shapes = _shapes_near(robot, int(carrier.parentJoint), tuple(held))
+    shapes = rigid_silhouettes(robot, int(carrier.parentJoint), tuple(held))
     if not shapes:
         return None
     data = robot.model.createData()
@@ -124,13 +125,16 @@ def contact_front(
     heights = corners @ d
     most = float(heights.max())
     near = corners[heights > most - _FLAT]
-    x, y, z = (float(v) for v in _nearest(near - np.outer(near @ d, d)) + most * d)
+    x, y, z = (float(v) for v in nearest_in_hull(near - np.outer(near @ d, d)) + most * d)
     return ContactFront(owners[int(heights.argmax())], (x, y, z), most - float(np.dot(offset, d)))
 
 
 @lru_cache(maxsize=64)
-def _shapes_near(robot: Robot, joint: int, held: tuple[str, ...]) -> tuple[Silhouette, ...]:
-    """Return the shapes of the links that do not move relative to the link of a joint; meshes are cached on disk."""
+def rigid_silhouettes(robot: Robot, joint: int, held: tuple[str, ...] = ()) -> tuple[Silhouette, ...]:
+    """Return the shapes of the links that do not move relative to the link of a joint, if the joints ``held`` do not.
+
+    Only the meshes of these links are read, and the result is cached on disk.
+    """
     described = read_shapes(robot)[0]
     group = rigid_groups(robot.model, held)
     near = [shape for shape in described if group[_joint(robot, shape.link)] == group[joint]]
@@ -169,10 +173,3 @@ def _silhouettes(robot: Robot, described: list[UrdfShape]) -> tuple[Silhouette, 
         placed = corners @ at.rotation.T + at.translation
         result.append(Silhouette(link, int(solid.parentJoint), placed, ball, disk))
     return tuple(result)
-
-
-def _nearest(flat: Array) -> Array:
-    """Return the point nearest to zero in the convex hull of points, shape (k, 3), m."""
-    # The weights minimize |Σ w p|² + (Σ w − 1)².  Divided by their sum, they give the nearest point.
-    weights = nonnegative_least_squares(np.vstack([flat.T, np.ones(len(flat))]), np.array([0.0, 0.0, 0.0, 1.0]))
-    return np.asarray(flat.T @ weights / weights.sum())

@@ -11,6 +11,7 @@ from impact_posture.collision.contact_front import ContactFront, contact_front
 from impact_posture.errors import ContactError
 from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_spec import Support
 from impact_posture.system.arrays import Array
 
 # A link that reaches less than this (m) beyond its contact point is not reported.
@@ -56,3 +57,19 @@ def at_front(robot: Robot, contact: ImpactContact, q: Array, held: Sequence[str]
         what = f"the links at {contact.frame} have no shapes, so their front is unknown"
         raise ContactError(what, where="contact_point", hint="give the contact point as `offset` X Y Z")
     return replace(contact, offset=front.offset)
+
+
+def sunken_feet(robot: Robot, supports: Sequence[Support], q: Array) -> list[str]:
+    """Return a warning for each foot that reaches more than :data:`BEYOND` below its contact point at ``q``."""
+    warnings = []
+    for foot in supports:
+        down = ImpactContact(foot.frame, (0.0, 0.0, 1.0), offset=foot.offset)
+        front = front_of(robot, down, q)
+        if front is not None and front.reach > BEYOND:
+            touch = EarlyTouch(down, front)
+            below = (
+                f"{1e3 * front.reach:.0f} mm below the contact point of the foot {foot.frame}, so it is in the ground"
+            )
+            hint = f"give robot.toml [[supports]] offset = [{touch.offset.replace(' ', ', ')}]"
+            warnings.append(f"{front.link} reaches {below}: {hint}")
+    return warnings

@@ -10,7 +10,7 @@ from impact_posture.config.problem_settings import ImpactSettings, ObjectiveKind
 from impact_posture.config.setting import stated as is_stated
 from impact_posture.config.text_parsers import parse_contact
 from impact_posture.errors import ContactError, FrameNotFound
-from impact_posture.impact.contact_point import BEYOND, EarlyTouch, at_front, front_of
+from impact_posture.impact.contact_point import BEYOND, EarlyTouch, at_front, front_of, sunken_feet
 from impact_posture.impact.elasticity.contact_compression import ContactStiffness
 from impact_posture.impact.evaluation.evaluation import Evaluation, evaluate
 from impact_posture.impact.impact_contact import ImpactContact, point_on
@@ -201,7 +201,8 @@ class ResolvedImpact:
             f"{touch.fact}: give {f'`offset` {touch.offset}, or ' if alone else ''}`contact_point` front"
             for touch in self.early_touches(self.q)
         ]
-        warnings = (*self.robot.warnings, *self.objective.warnings, *early)
+        feet = sunken_feet(self.robot, self.supports, self.q)
+        warnings = (*self.robot.warnings, *self.objective.warnings, *early, *feet)
         if not self.missing_support:
             return warnings
         return (*warnings, f"{self.robot.name} is assumed to be floating freely, {FLOATS}; {self.missing_support}")

@@ -7,6 +7,7 @@ from typing import get_args
 
 import numpy as np
 
+from impact_posture.collision.foot_shape import measured_sole
 from impact_posture.config.problem_settings import SupportKind
 from impact_posture.errors import ContactError, FrameNotFound, InputError
 from impact_posture.impact.impact_contact import ImpactContact, point_on
@@ -19,7 +20,7 @@ def resolve_supports(robot: Robot, texts: Sequence[str] | None) -> tuple[Support
     """Turn texts ``FRAME[:point|surface]`` into supports; for ``None``, return the supports in ``robot.toml``.
 
     If ``robot.toml`` lists the frame, the offset and size in ``robot.toml`` are used.  The kind (point or
-    surface) in ``robot.toml`` is used unless the text states a kind.
+    surface) in ``robot.toml`` is used unless the text states a kind.  The sole of a surface without size is measured.
 
     Raises:
         FrameNotFound: The robot has no such frame; the error lists the nearest names.
@@ -31,7 +32,7 @@ def resolve_supports(robot: Robot, texts: Sequence[str] | None) -> tuple[Support
         if sum(s.frame == support.frame for s in supports) > 1:
             raise InputError(f"frame '{support.frame}' is given twice", where="support", hint="remove one")
         point_on(robot, support.frame, support.offset)
-    return supports
+    return tuple(measured_sole(robot, s) if s.kind == "surface" and not s.has_sole else s for s in supports)
 
 
 def _support(robot: Robot, text: str, known: Mapping[str, Support]) -> Support:

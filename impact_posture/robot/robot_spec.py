@@ -66,7 +66,8 @@ class Support(_Table):
         kind: ``point`` keeps the velocity of the contact point at zero.  ``surface`` also keeps the angular velocity
             at zero.
         offset: Contact point relative to the origin of the frame, in the frame, meters.
-        size: Half extents (x, y) of the sole around the contact point, in the frame, meters.
+        size: Half extents (x, y) of the sole around the contact point, in the frame, meters.  If it is zero, the size
+            of a surface is measured on the shapes of the foot.  A surface without size and shapes bears no moment.
     """
 
     frame: str
@@ -78,6 +79,12 @@ class Support(_Table):
     def rows(self) -> int:
         """Number of velocity components that the foot keeps at zero."""
         return 3 if self.kind == "point" else 6
+
+    @property
+    def corners(self) -> tuple[Vector3, ...]:
+        """Corners of the sole in the frame, m; they coincide if the size is zero."""
+        (x, y, z), (half_x, half_y) = self.offset, self.size
+        return tuple((x + i * half_x, y + j * half_y, z) for i in (-1, 1) for j in (-1, 1))
 
     @property
     def has_sole(self) -> bool:

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from impact_posture.system.arrays import Array
+from impact_posture.system.arrays import Array, nonnegative_least_squares
 
 # A point within this distance (m) of a line counts as on the line.  Edges are rounded to this number of decimals.
 _ROUNDING, _DIGITS = 1e-9, 12
@@ -58,6 +58,14 @@ def polygon_edges(points: Iterable[Array]) -> tuple[Array, Array] | None:
     # Round and sort the edges, so that feet in another order give the same edges.
     edges = np.unique(np.round(np.column_stack([normals, offsets]), _DIGITS), axis=0)
     return edges[:, :2], edges[:, 2]
+
+
+def nearest_in_hull(points: Array) -> Array:
+    """Return the point nearest to zero in the convex hull of points, shape (k, d), m."""
+    # The weights minimize |Σ w p|² + (Σ w − 1)².  Divided by their sum, they give the nearest point.
+    equations = np.vstack([points.T, np.ones(len(points))])
+    weights = nonnegative_least_squares(equations, np.append(np.zeros(points.shape[1]), 1.0))
+    return np.asarray(points.T @ weights / weights.sum())
 
 
 def _height(start: Array, end: Array, point: Array) -> float:

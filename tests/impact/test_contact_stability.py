@@ -11,7 +11,7 @@ import pytest
 
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import Tree
-from impact_posture.impact.friction.contact_stability import contact_stability
+from impact_posture.impact.friction.contact_stability import FrictionCones, contact_stability
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.impact.metric import Metric
@@ -37,6 +37,15 @@ def standing(name: str) -> tuple[Robot, tuple[Support, ...]]:
 def oracle_of(name: str, normal: tuple[float, float, float], frame: str = "base_link") -> ImpactOracle:
     loaded, supports = standing(name)
     return ImpactOracle(ImpactCase(loaded, ImpactContact(frame, normal), Metric(), supports, 1e-6))
+
+
+def test_a_sole_without_size_bears_no_moment() -> None:
+    """A sole of 10 × 6 cm (half extents) bears 0.06 N·m s of a unit impulse about x, 0.1 about y, 0.056 about z."""
+    moments = np.array([[0.05, 0, 0], [0, 0.09, 0], [0, 0, 0.05], [0, 0, 0]])
+    impulses = np.hstack([np.tile([0.0, 0.0, 1.0], (4, 1)), moments])
+    for size, borne in (((0.1, 0.06), [True] * 4), ((0.0, 0.0), [False] * 3 + [True])):
+        A, _ = FrictionCones((Support("foot", "surface", size=size),), [np.eye(3)]).matrix(0.7)
+        assert (A @ impulses.T <= 1e-12).all(axis=0).tolist() == borne
 
 
 @pytest.mark.parametrize("name", ["solo8", "solo12"])

@@ -11,8 +11,8 @@ import pytest
 from impact_posture.collision.robot_shapes import shape_warnings
 from impact_posture.config.problem_settings import LoadOptions
 from impact_posture.config.table_validation import validate
+from impact_posture.draft.draft import write_draft
 from impact_posture.errors import ImpactPostureError, InertiaError, SpecError, UrdfError
-from impact_posture.robot.draft import write_draft
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.robot.robot_spec import RotorSpec
 

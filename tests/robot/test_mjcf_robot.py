@@ -14,11 +14,11 @@ from impact_posture.collision.coal_geometry import load_geometry, read_shapes
 from impact_posture.collision.shape_corners import shape_points
 from impact_posture.collision.shape_pairs import disabled_links
 from impact_posture.config.problem_settings import LoadOptions
+from impact_posture.draft.draft import write_draft
 from impact_posture.dynamics.mjcf_layout import file_layout
 from impact_posture.errors import InputError, MjcfError
 from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
-from impact_posture.robot.draft import write_draft
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.verification.verification import verify

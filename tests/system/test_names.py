@@ -29,6 +29,7 @@ from impact_posture.codegen.export import default_prefix, export
 from impact_posture.codegen.export_library import named_objectives
 from impact_posture.config.problem_settings import LoadOptions, ProblemSettings
 from impact_posture.config.table_validation import validate
+from impact_posture.draft.draft import write_draft
 from impact_posture.dynamics.mjcf import build_mjcf
 from impact_posture.experiment.reproduction import Reproduction
 from impact_posture.experiment.reproduction_summary import summary
@@ -38,7 +39,6 @@ from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.output.plot import ResultView, save
 from impact_posture.output.plot.jump_figure import jump_figure
 from impact_posture.posture.formulation.problem_file import dump_settings, read_settings
-from impact_posture.robot.draft import write_draft
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.robot.robot_spec import RobotSpec, read_spec

@@ -15,11 +15,11 @@ from matplotlib.figure import Figure
 
 import impact_posture as ip
 from impact_posture.config.problem_settings import LoadOptions
+from impact_posture.draft.draft import write_draft
 from impact_posture.errors import InputError, OutputError
 from impact_posture.experiment.run_reports import write_run_report
 from impact_posture.output.plot.style import save
 from impact_posture.output.result_reader import load_view
-from impact_posture.robot.draft import write_draft
 from impact_posture.robot.posture_files import read_posture
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.simulation.scenario_file import read_scenario

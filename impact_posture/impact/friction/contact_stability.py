@@ -135,7 +135,7 @@ class FrictionCones:
             rows.append(np.zeros(self._size))
             rows[-1][start : start + len(entries)] = entries
 
-        for start, support, R in (foot for foot in self._feet if foot[1].has_sole):
+        for start, support, R in (foot for foot in self._feet if foot[1].kind == "surface"):
             for axis, reach in ((0, support.size[1]), (1, support.size[0])):
                 for sign in (1.0, -1.0):
                     add(f"{support.frame} tips", start, np.array([0.0, 0.0, -reach, *(sign * R[:, axis])]))
@@ -143,7 +143,7 @@ class FrictionCones:
         for start, support, _ in self._feet:
             for angle in 2 * np.pi * np.arange(_SIDES) / _SIDES:
                 add(f"{support.frame} slides", start, np.array([np.cos(angle), np.sin(angle), -inner]))
-            if support.has_sole:
+            if support.kind == "surface":
                 twist = friction * sum(support.size) / 2
                 for sign in (1.0, -1.0):
                     add(f"{support.frame} turns", start, np.array([0.0, 0.0, -twist, 0.0, 0.0, sign]))

@@ -36,8 +36,6 @@ _STEPS = 8
 _SHORTEST = 1e-4
 # A statue stands if its feet balance the weight up to this share.
 _STANDS = 1e-6
-# A singular value below this share of the largest one is a rounding error.
-_RANK = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,8 +58,7 @@ class UnilateralImpact:
 class StandingFeet:
     """The contact points of the feet at one posture: their Jacobian, and the forces that carry the weight.
 
-    A point foot has one contact point.  A sole of known size has its four corners.  A sole of unknown size has one
-    point and does not turn.
+    A sole of known size has its four corners.  Another foot has one contact point.
 
     Attributes:
         frames: Frame of the foot for each contact point.
@@ -74,26 +71,21 @@ class StandingFeet:
         oracle.at(q)
         self._oracle, self._q, self.friction = oracle, q, friction
         self.frames: list[str] = []
-        rows, turns = [], []
+        rows = []
         for foot, support in zip(oracle.feet, supports, strict=True):
             J, R = oracle.numeric.jacobian(foot.point), oracle.numeric.placement(foot.point).rotation
             X, Y = support.size if support.has_sole else (0.0, 0.0)
             corners = [R @ (x, y, 0.0) for x in (-X, X) for y in (-Y, Y)] if support.has_sole else [np.zeros(3)]
             rows += [J[:3] - pin.skew(corner) @ J[3:] for corner in corners]
-            turns += [J[3:]] if support.kind == "surface" and not support.has_sole else []
             self.frames += [support.frame] * len(corners)
         self.normals = np.tile([0.0, 0.0, 1.0], (len(self.frames), 1))
-        turning = np.vstack([np.zeros((0, oracle.robot.nv)), *turns])
-        self.M, self.jacobian, self._turning = hold_locked(
-            oracle.numeric.locked, oracle.numeric.mass_matrix(), np.vstack(rows), turning
-        )
+        M = oracle.numeric.mass_matrix()
+        self.M, self.jacobian = hold_locked(oracle.numeric.locked, M, np.vstack(rows))
         self.forces = self._carried()
 
     def respond(self, J: Array) -> Array:
-        """Return ``M⁻¹Jᵀ``, where soles of unknown size do not turn; shape (nv, rows of ``J``)."""
-        free, fixed = np.linalg.solve(self.M, J.T), np.linalg.solve(self.M, self._turning.T)
-        inverse = np.linalg.pinv(self._turning @ fixed, rcond=_RANK, hermitian=True)
-        return np.asarray(free - fixed @ inverse @ (self._turning @ free))
+        """Return ``M⁻¹Jᵀ``, shape (nv, rows of ``J``)."""
+        return np.asarray(np.linalg.solve(self.M, J.T))
 
     def _carried(self) -> Array | None:
         """Return the forces under the weight if the robot is a rigid body: they stop its fall of one second."""

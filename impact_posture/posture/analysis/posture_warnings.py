@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import listed
 from impact_posture.impact.impact_contact import point_on
 from impact_posture.posture.formulation.problem_file import Prepared
 from impact_posture.posture.loads.holding_forces import HoldingForces
 from impact_posture.robot.model_joints import rigid_groups
+from impact_posture.robot.support_polygon import nearest_in_hull, polygon_edges
 from impact_posture.system.arrays import Array
 
+# A center of mass at most this far (m) outside the feet is not reported.
+_OUTSIDE = 0.01
 # Origins of joints or links farther than this (m) behind a surface or below the ground are reported.
 _BEHIND = 0.01
 
@@ -29,7 +34,30 @@ def posture_warnings(
             f"in the {name} posture, {touch.fact}: give `offset` {touch.offset}, or `contact_pose` full"
             for touch in prepared.impact.early_touches(q)
         ]
+    held += _balance_warnings(prepared, q, name) if holding is None else []
     return [*held, *_surface_warnings(prepared, initial, q, name), *_ground_warnings(prepared, q, name)]
+
+
+def _balance_warnings(prepared: Prepared, q: Array, posture: str) -> list[str]:
+    """Warn about a center of mass that is not above the feet; no constraint keeps it there."""
+    robot, supports = prepared.impact.robot, prepared.impact.supports
+    if not supports:
+        return []
+    numeric = Numeric(robot.model).at(q)
+    points = [point_on(robot, support.frame, corner) for support in supports for corner in support.corners]
+    corners = np.array([numeric.placement(point).translation[:2] for point in points])
+    outside = float(np.linalg.norm(nearest_in_hull(corners - numeric.center_of_mass()[0][:2])))
+    if outside <= _OUTSIDE:
+        return []
+    hint = (
+        "require `com_over_feet`"
+        if polygon_edges(corners)
+        else "give the soles a size (robot.toml [[supports]] size)"
+    )
+    text = (
+        f"the {posture} posture has the center of mass {outside:.2g} m outside the feet, so the robot falls: {hint}"
+    )
+    return [text]
 
 
 def _surface_warnings(prepared: Prepared, initial: Array, q: Array, posture: str) -> list[str]:

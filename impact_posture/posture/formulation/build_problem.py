@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import product
 
 import numpy as np
 import pinocchio as pin
@@ -236,11 +235,8 @@ def _base_constraints(robot: Robot, numeric: Numeric, requirements: Requirements
 def _com_constraint(
     robot: Robot, supports: Sequence[Support], numeric: Numeric, margin: float
 ) -> CenterOfMassOverFeet:
-    corners = []
-    for support in supports:
-        placement = numeric.placement(point_on(robot, support.frame, support.offset))
-        for x, y in product((-support.size[0], support.size[0]), (-support.size[1], support.size[1])):
-            corners.append(placement.act(np.array([x, y, 0.0]))[:2])
+    points = [point_on(robot, support.frame, corner) for support in supports for corner in support.corners]
+    corners = [numeric.placement(point).translation[:2] for point in points]
     edges = polygon_edges(corners)
     if edges is None:
         fault = "the feet span no area above which the center of mass could stay"

@@ -105,9 +105,7 @@ def load_cases(objective: Objective, q: Array, requirements: Requirements) -> Lo
         )
     if unknown:
         return LoadCases((), (f"whether the robot can hold the posture is not checked: {unknown}",), unknown)
-    free = [s.frame for s in objective.supports if feet and s.kind == "surface" and not s.has_sole]
-    notes = [f"the moments that {', '.join(free)} can support are not checked: the sole has no size"] if free else []
-    notes += _unlimited(robot)
+    notes = _unlimited(robot)
     kinds = ["joint torques", *["rotor thrusts"] * bool(rotors), *["forces of the feet"] * bool(feet)]
     what = " and ".join([", ".join(kinds[:-1]), kinds[-1]] if kinds[1:] else kinds)
     sources, balance, thrusts = [*rotors, *feet], reach[:rank], Thrusts()
@@ -181,13 +179,9 @@ def _feet(objective: Objective, weight: float, friction: float) -> list[ForceSou
     edges = np.array([slope * np.cos(angles), slope * np.sin(angles), np.ones(_EDGES)])
     sources = []
     for support in objective.supports:
-        signs = [(x, y) for x in (-1, 1) for y in (-1, 1)] if support.has_sole else [(0, 0)]
         columns, lower = np.vstack([edges, np.zeros_like(edges)]), np.zeros(_EDGES)
-        if support.kind == "surface" and not support.has_sole:
-            columns, lower = np.hstack([columns, np.eye(6)[:, 3:]]), np.append(lower, np.full(3, -np.inf))
-        for x, y in signs:
-            (ox, oy, oz), (half_x, half_y) = support.offset, support.size
-            point = point_on(objective.robot, support.frame, (ox + x * half_x, oy + y * half_y, oz))
+        for corner in support.corners if support.has_sole else (support.offset,):
+            point = point_on(objective.robot, support.frame, corner)
             names = (support.frame,) * lower.size
             sources.append(ForceSource(point, weight * columns, lower, np.full(lower.size, np.inf), names))
     return sources

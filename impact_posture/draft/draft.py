@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 
-from impact_posture.config.problem_settings import LoadOptions, Root
+from impact_posture.collision.foot_shape import support
+from impact_posture.config.problem_settings import LoadOptions, RobotSettings, Root
+from impact_posture.draft.toml_lines import Draft, comment_lines
 from impact_posture.errors import InputError, MjcfError, OutputError, UrdfError
 from impact_posture.robot import guessed_parts as guess
-from impact_posture.robot.foot_shape import foot_specs, support_depth
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import Located, build_robot, known_robots, load_robot, locate
 from impact_posture.robot.robot_spec import SCHEMA, ModelSpec, RobotSpec, Support
-from impact_posture.robot.toml_lines import Draft, comment_lines
+from impact_posture.robot.support_polygon import polygon_edges
 from impact_posture.robot.urdf import EXAMPLE_PREFIX, example_robot_data, resolve_path
 from impact_posture.system.escape import toml
 from impact_posture.system.output_folder import check_name
@@ -121,7 +124,9 @@ def draft_spec(located: Located, options: LoadOptions, folder: Path) -> Draft:
             f"joints = {toml(dict.fromkeys(robot.joint_names[:2], 0.5))}",
         )
     carrying = _contact(draft, robot, feet, [link for link in ends if link not in legs])
-    supports = foot_specs(robot, feet, located.urdf)
+    # Two feet on legs of six or more joints are assumed to be flat.
+    flat = [len(feet) == 2 and len(guess.joints_to(robot, foot)) > 5 for foot in feet]
+    supports = [support(robot, foot, flat=level) for foot, level in zip(feet, flat, strict=True)]
     _supports(draft, robot, supports)
     _constraints(draft, robot, supports, carrying)
     _limits(draft, robot)
@@ -136,7 +141,10 @@ def _load(located: Located, options: LoadOptions, root: Root | None, srdf: Path 
         package_dir=options.package_dir, armature=options.armature, lock=options.lock, lock_massless=True
     )
     model = ModelSpec(root=root, srdf=None if srdf is None else str(srdf), accept_inertias=True)
-    return build_robot(located._replace(spec=RobotSpec(model=model)), plain)
+    robot = build_robot(located._replace(spec=RobotSpec(model=model)), plain)
+    # The shapes of the feet are searched with these settings.
+    settings = RobotSettings(robot=located.source, config=os.devnull, package_dir=options.package_dir)
+    return replace(robot, settings=settings)
 
 
 def _model(draft: Draft, robot: Robot, options: LoadOptions, folder: Path) -> None:
@@ -191,20 +199,35 @@ def _supports(draft: Draft, robot: Robot, feet: Sequence[Support]) -> None:
     if robot.floating and not feet:
         text = "No feet were found, so the robot is assumed to float. If it stands, list each foot:"
         draft.note(text, "[[supports]]", 'frame = "FOOT"', 'kind = "point"')
+    placements = guess.upright_frames(robot)
     for foot in feet:
         draft.lines += ["", "[[supports]]"]
         draft.key("frame", foot.frame, "a foot according to the SRDF, its name or its height", guessed=True)
-        reason = "a flat collision shape" if any(foot.size) else "one of two feet, on a leg of six joints"
-        reason = reason if foot.kind == "surface" else "no flat collision shape"
+        reason = "its shapes are flat below" if any(foot.size) else "one of two feet, on a leg of six joints"
+        reason = reason if foot.kind == "surface" else "its shapes are not flat below"
         draft.key("kind", foot.kind, reason, guessed=True)
         if any(foot.offset):
-            draft.key("offset", list(foot.offset), "lowest point of its collision shapes at the default posture")
+            draft.key("offset", list(foot.offset), "lowest point of its shapes at the default posture")
         else:
             draft.lines += comment_lines(
-                "offset: it has no shape, or a mesh (not opened), so the frame's origin touches the ground"
+                "offset: it has no shape that can be read, so the frame's origin touches the ground"
             )
         if any(foot.size):
-            draft.key("size", list(foot.size), "the sole, from its collision shapes")
+            tilt = np.degrees(np.arccos(min(1.0, placements.oMf[robot.frame_id(foot.frame)].rotation[2, 2])))
+            flat = "" if tilt < 1 else f"; it is tilted by {tilt:.2g} degrees at the default posture"
+            draft.key("size", list(foot.size), f"m, half of the sole, from its shapes{flat}", guessed=bool(flat))
+
+
+def _support_depth(robot: Robot, feet: Sequence[Support]) -> float:
+    """Return the distance from the center of mass to the support polygon's edges, m; negative if outside."""
+    model, q = robot.model, robot.posture()
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, q)
+    center = np.array(pin.centerOfMass(model, data, q))[:2]
+    placements = [(data.oMf[robot.frame_id(foot.frame)], foot) for foot in feet]
+    corners = [at.act(np.array(corner))[:2] for at, foot in placements for corner in foot.corners]
+    edges = polygon_edges(corners)
+    return -1.0 if edges is None else float(np.min(edges[1] - edges[0] @ center))
 
 
 def _constraints(draft: Draft, robot: Robot, feet: Sequence[Support], carrying: Sequence[str]) -> None:
@@ -216,7 +239,7 @@ def _constraints(draft: Draft, robot: Robot, feet: Sequence[Support], carrying: 
     if robot.floating and not feet:
         keys.key("level_base", True, "it floats, upright", guessed=True)
     if feet:
-        depth = support_depth(robot, feet)
+        depth = _support_depth(robot, feet)
         if depth > _LEAST_DEPTH:
             keys.key("com_over_feet", True, f"at the default posture it is {depth:.2g} m inside", guessed=True)
             keys.key("com_margin", 0.01, "m, our choice", guessed=True)

@@ -12,17 +12,17 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from impact_posture.collision.foot_shape import support
 from impact_posture.config.problem_settings import LoadOptions
+from impact_posture.draft.draft import write_draft
+from impact_posture.draft.toml_lines import Draft
 from impact_posture.errors import InputError, OutputError, UrdfError
 from impact_posture.posture.formulation.problem_file import prepare
 from impact_posture.posture.search.multistart import solve
 from impact_posture.robot.actuation import hover
-from impact_posture.robot.draft import write_draft
-from impact_posture.robot.foot_shape import support
 from impact_posture.robot.guessed_parts import feet, tips
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.robot.robot_spec import RobotSpec, read_spec
-from impact_posture.robot.toml_lines import Draft
 from impact_posture.robot.urdf import EXAMPLE_PREFIX, example_robot_data, robots_data
 from tests.support.helpers import NAMES
 from tests.support.settings import make_settings
@@ -72,23 +72,27 @@ def test_feet_and_tips_by_names_and_geometry(path: str, expected: tuple[str, ...
     [
         ("b1_description/urdf/b1-z1.urdf", "FL_foot", "point", (0, 0)),
         ("talos_data/robots/talos_reduced_box.urdf", "left_sole_link", "surface", (0.105, 0.065)),
-        ("g1_description/urdf/g1_29dof_rev_1_0.urdf", "left_ankle_roll_link", "surface", (0.085, 0.03)),
+        ("talos_data/robots/talos_reduced.urdf", "left_sole_link", "surface", (0.0852, 0.0318)),
+        ("g1_description/urdf/g1_29dof_rev_1_0.urdf", "left_ankle_roll_link", "surface", (0.085, 0.025)),
         ("go2_description/urdf/go2.urdf", "FL_foot", "point", (0, 0)),
     ],
 )
-def test_a_sole_is_read_from_balls_and_boxes(path: str, foot: str, kind: str, size: tuple[float, float]) -> None:
-    """The foot is a ball on b1, a box on talos, four balls on g1, and a mesh on go2, which is not read."""
+def test_a_sole_is_read_from_balls_boxes_and_meshes(
+    path: str, foot: str, kind: str, size: tuple[float, float]
+) -> None:
+    """The foot is a ball on b1, a box or a mesh on talos, four balls on g1, and a mesh of a ball on go2."""
     loaded = load_robot(uri(path), LoadOptions(root="free-flyer"))
-    spec = support(loaded, foot, example_robot_data() / path, flat=False)
+    spec = support(loaded, foot, flat=False)
     assert spec.kind == kind
-    assert spec.size == pytest.approx(size, abs=1e-3)
-    assert any(spec.offset) == ("go2" not in path)
-    if kind == "point" and any(spec.offset):
-        # The lowest point of a ball-shaped foot is one radius below its center.
+    assert spec.size == pytest.approx(size, abs=2e-4)
+    assert any(spec.offset)
+    if foot == "FL_foot":
         data = loaded.model.createData()
         pin.framesForwardKinematics(loaded.model, data, loaded.posture())
         down = data.oMf[loaded.frame_id(foot)].rotation @ np.array(spec.offset)
-        np.testing.assert_allclose(down, [0, 0, -0.04], atol=2e-4)
+        # The lowest point of a ball is one radius below its center; the mesh of go2 is about 23 mm high.
+        lowest, tolerance = ((0, 0, -0.04), 2e-4) if "b1" in path else ((0, 0, -0.023), 5e-3)
+        np.testing.assert_allclose(down, lowest, atol=tolerance)
 
 
 def commented(text: str) -> list[str]:

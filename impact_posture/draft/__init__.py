@@ -1,0 +1,1 @@
+"""Drafts of ``robot.toml`` from a URDF."""

@@ -1,0 +1,59 @@
+"""A biped with legs of six joints, whose feet have a given shape, and binary STL files."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from impact_posture.system.arrays import Array
+
+
+def write_hull(path: Path, points: Array) -> None:
+    """Write the convex hull of points, shape (k, 3), as a binary STL file."""
+    triangles = points[ConvexHull(points).simplices]
+    records = np.zeros(len(triangles), dtype=[("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("unused", "<u2")])
+    records["corners"] = triangles
+    path.write_bytes(b"\0" * 80 + struct.pack("<I", len(triangles)) + records.tobytes())
+
+
+def biped(foot: str) -> str:
+    """Return the URDF of a biped; ``foot`` are the shapes of its links ``left_foot`` and ``right_foot``.
+
+    The ankles are 0.66 m below the hips.
+    """
+    hips = _link("hips", 8.0, _box("0.16 0.2 0.12", 0.1))
+    return f'<robot name="biped">{hips}{_leg("left", 1, foot)}{_leg("right", -1, foot)}</robot>'
+
+
+def _leg(side: str, sign: int, foot: str) -> str:
+    links = [
+        ("hip1", "0 {y} 0", "0 0 1", (-1.0, 1.0), 0.5, ""),
+        ("hip2", "0 0 -0.03", "1 0 0", (-0.6, 0.6), 0.5, ""),
+        ("thigh", "0 0 -0.03", "0 1 0", (-1.6, 1.6), 2.0, _box("0.08 0.08 0.22", -0.15)),
+        ("shin", "0 0 -0.3", "0 1 0", (0.0, 2.0), 1.5, _box("0.06 0.06 0.2", -0.14)),
+        ("fork", "0 0 -0.3", "0 1 0", (-1.0, 1.0), 0.3, ""),
+        ("foot", "0 0 0", "1 0 0", (-0.4, 0.4), 0.6, foot),
+    ]
+    parent, text = "hips", ""
+    for name, xyz, axis, (low, high), mass, shapes in links:
+        child = f"{side}_{name}"
+        text += (
+            f'<joint name="to_{child}" type="revolute"><parent link="{parent}"/><child link="{child}"/>'
+            f'<origin xyz="{xyz.format(y=0.1 * sign)}"/><axis xyz="{axis}"/>'
+            f'<limit lower="{low}" upper="{high}" effort="100" velocity="5"/></joint>{_link(child, mass, shapes)}'
+        )
+        parent = child
+    return text
+
+
+def _link(name: str, mass: float, shapes: str) -> str:
+    moment = 0.01 * mass
+    inertia = f'<inertia ixx="{moment}" iyy="{moment}" izz="{moment}" ixy="0" ixz="0" iyz="0"/>'
+    return f'<link name="{name}"><inertial><mass value="{mass}"/>{inertia}</inertial>{shapes}</link>'
+
+
+def _box(size: str, z: float) -> str:
+    return f'<collision><origin xyz="0 0 {z}"/><geometry><box size="{size}"/></geometry></collision>'
