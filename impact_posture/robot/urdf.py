@@ -199,13 +199,13 @@ def _xml_text(path: Path) -> str:
 
 
 def _xacro_leftover(root: ET.Element) -> str:
-    """Return the first xacro element, or the first xacro expression in a link or joint; empty if there is none."""
+    """Return the first xacro element, or the first number that is a xacro expression; empty without both."""
     for element in root:
         if element.tag.startswith("xacro:"):
             return f"<{element.tag}>"
         for part in element.iter() if element.tag in ("link", "joint") else ():
             for key, value in part.items():
-                if ("${" in value or "$(" in value) and part.tag != "mesh":
+                if ("${" in value or "$(" in value) and key not in ("name", "link", "joint", "filename"):
                     return f"'{value}' in <{part.tag} {key}>"
     return ""
 
