@@ -14,7 +14,7 @@ import pinocchio as pin
 from impact_posture.collision.foot_shape import support
 from impact_posture.config.problem_settings import LoadOptions, RobotSettings, Root
 from impact_posture.draft.toml_lines import Draft, comment_lines
-from impact_posture.errors import InputError, MjcfError, OutputError, UrdfError
+from impact_posture.errors import InertiaError, InputError, MjcfError, OutputError, UrdfError
 from impact_posture.robot import guessed_parts as guess
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import Located, build_robot, known_robots, load_robot, locate
@@ -76,7 +76,7 @@ def draft_spec(located: Located, options: LoadOptions, folder: Path) -> Draft:
     try:
         robot = _load(located, options, options.root, srdf)
     except UrdfError as error:  # A fixed robot without joints cannot move.
-        if options.root or isinstance(error, MjcfError):
+        if options.root or isinstance(error, (MjcfError, InertiaError)):
             raise
         robot = _load(located, options, "free-flyer", srdf)
     ends = guess.srdf_end_effectors(srdf)
