@@ -23,6 +23,7 @@ from impact_posture.posture.search.growing_search import GrowingSearch, Progress
 from impact_posture.posture.search.impact_notes import notes_on_impacts
 from impact_posture.posture.search.initial_posture import initial_objective, initial_posture
 from impact_posture.posture.search.screening import screen, screenable
+from impact_posture.posture.search.singular_target import singular_target
 from impact_posture.posture.search.start_draws import StartDraws
 from impact_posture.posture.search.unseen_optima import SearchEstimate, hits_by_value
 from impact_posture.system.arrays import Array
@@ -138,7 +139,7 @@ def solve(
     problem, nlp = search.problem, search.nlp
     certified = [r for r in runs if r.good]
     if not certified:
-        raise _failure(runs)
+        raise _failure(problem, runs)
     good, touching = _without_collisions(problem, certified)
     if not good:
         fault = f"original shapes touch at all {len(certified)} certified postures: {touching}"
@@ -264,7 +265,7 @@ def wrapped_difference(problem: ConstrainedProblem, one: Array, other: Array) ->
     return step
 
 
-def _failure(runs: list[SolverRun]) -> SolverFailed:
+def _failure(problem: ConstrainedProblem, runs: list[SolverRun]) -> SolverFailed:
     solved = [(r.record, r.certificate) for r in runs if r.record is not None and r.certificate is not None]
     if not solved:
         return SolverFailed(
@@ -274,9 +275,10 @@ def _failure(runs: list[SolverRun]) -> SolverFailed:
         )
     statuses = sorted({record.status for record, _ in solved})
     nearest = min((certificate for _, certificate in solved), key=lambda c: c.stationarity)
-    return SolverFailed(
-        f"none of {len(solved)} feasible starts ended at a certified posture (solver: {', '.join(statuses)}; best "
-        f"stationarity {nearest.stationarity:.1e}, violation {nearest.primal:.1e})",
-        where="solver",
-        hint="try more `starts`, another `seed` or `posture`, or a small `regularization`",
-    )
+    fault = f"none of {len(solved)} feasible starts ended at a certified posture"
+    hint = "try more `starts`, another `seed` or `posture`, or a small `regularization`"
+    singular = singular_target(problem, [record.q for record, _ in solved])
+    if singular is not None:
+        return SolverFailed(f"{fault}: {singular.fact}", where="solver", hint=singular.hint)
+    numbers = f"best stationarity {nearest.stationarity:.1e}, violation {nearest.primal:.1e}"
+    return SolverFailed(f"{fault} (solver: {', '.join(statuses)}; {numbers})", where="solver", hint=hint)
