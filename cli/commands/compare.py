@@ -42,7 +42,7 @@ def compare(
     from impact_posture.experiment.experiment_folders import FORMATS, Output, store_beside, write_comparison
     from impact_posture.experiment.jobs import controller_factory
     from impact_posture.experiment.reproduction import reproduce
-    from impact_posture.experiment.seed_statistics import FEWEST, without_noise
+    from impact_posture.experiment.seed_statistics import statistic
     from impact_posture.system.output_folder import check_output
 
     plan = {scenario: list(dict.fromkeys(labels))}
@@ -63,11 +63,9 @@ def compare(
     if json:
         print_json(reproduction.comparison())
         return
-    statistic = "mean ± half of the 95 % interval" if seeds >= FEWEST else f"means (intervals from {FEWEST} seeds on)"
-    if without_noise(metric for row in reproduction.rows for metric in row.metrics.values()):
-        statistic = "all alike, because the scenario has no noise"
-    page.title(reproduction.rows[0].scenario, f"{seeds} seeds, {statistic}" if seeds > 1 else "1 seed")
-    rows_table(page, reproduction.rows)
+    rows = reproduction.rows
+    page.title(rows[0].scenario, statistic(seeds, [metric for row in rows for metric in row.metrics.values()]))
+    rows_table(page, rows)
     if folder is not None:
         page.gap()
         page.line(f"written: {folder}")

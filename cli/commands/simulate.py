@@ -137,6 +137,8 @@ def _rigid(prediction: dict[str, Any]) -> str:
 
 
 def _show(page: Page, document: dict[str, Any], label: str, folder: Path, notes: list[str]) -> None:
+    from impact_posture.experiment.run_report_content import load_rows
+
     page.title(f"{document['scenario']}, {label}", f"seed {document['seed']}")
     runs = document["runs"]
     rows = [("status", document["status"])]
@@ -152,9 +154,10 @@ def _show(page: Page, document: dict[str, Any], label: str, folder: Path, notes:
     if any(window["kind"] == "dwell" for window in document["windows"]):
         rows.append(("contacts", f"{count['contacts']} of {count['contacts_asked']}"))
     page.pairs(rows)
-    if document["prediction"] is not None and (loads := _loads(document["prediction"])):
+    if document["prediction"] is not None and (loads := load_rows(document["prediction"])):
         page.gap()
-        page.table(("  in the impact", "measured", "rigid prediction"), loads)
+        head = ("  in the impact", "measured", "rigid prediction", "unit")
+        page.table(head, [(f"  {row[0]}", *row[1:-1]) for row in loads], right=(1, 2))
     if len(runs) > 1 and document["metrics"] is not None:
         page.gap()
         parts = [
@@ -174,25 +177,6 @@ def _show(page: Page, document: dict[str, Any], label: str, folder: Path, notes:
         notes.append("the robot was not at rest before the push: the numbers include its own motion")
     page.warnings(notes)
     page.line(f"written: {folder}")
-
-
-def _loads(prediction: dict[str, Any]) -> list[tuple[str, ...]]:
-    """Return rows with the effects on base, worst joint and contact, as measured and as predicted."""
-    loads = [prediction[key] for key in ("measured_impact", "predicted_impact")]
-    if loads[0] is None:
-        return []
-    rows: list[tuple[str, ...]] = []
-    if loads[0]["base_linear"] is not None:
-        bases = [f"{number(load['base_linear'])} m/s, {number(load['base_angular'])} rad/s" for load in loads]
-        rows.append(("  base", *bases))
-    if loads[0]["joint"] is not None:
-        rows.append(("  worst joint, % of its limit", *(_joint(load["joint"]) for load in loads)))
-    return [*rows, ("  normal impulse", *(f"{number(load['impulse'])} N·s" for load in loads))]
-
-
-def _joint(joint: dict[str, Any]) -> str:
-    share = "" if joint["share"] is None else f", {100 * joint['share']:.3g} %"
-    return f"{joint['name']} {number(joint['velocity'])} {joint['unit']}{share}"
 
 
 def _numbers(metrics: dict[str, Any], prediction: dict[str, Any]) -> list[tuple[str, str]]:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from impact_posture.experiment.reproduction import FITTED, PAPER, Reproduction, missed_targets
-from impact_posture.experiment.seed_statistics import FEWEST, ControllerRow, Interval
+from impact_posture.experiment.seed_statistics import ControllerRow, Interval, statistic
 from impact_posture.simulation.controllers.controller_factory import MEANING
 from impact_posture.system.escape import markdown
 
@@ -94,11 +94,9 @@ def _table(head: str, rows: Sequence[Sequence[str]]) -> str:
 
 def summary(results: Reproduction) -> str:
     """Return the content of ``SUMMARY.md``."""
-    many = f"{results.seeds} seeds" if results.seeds > 1 else "one seed"
-    shown = ", with 95 % confidence intervals." if results.seeds >= FEWEST else ", so there are no intervals."
     parts = [
         "# The experiments of the paper, simulated again",
-        f"Means over {many}{shown}",
+        f"Numbers: {statistic(results.seeds, [])}.",
         "## What to choose",
         "\n".join(f"- {line}" for line in advice(results)),
         "## Table I of Afifi et al. 2026, and ours",

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from impact_posture.experiment.jobs import Document, Job, controller_factory
-from impact_posture.experiment.seed_statistics import FEWEST, Interval, headline, without_noise
+from impact_posture.experiment.seed_statistics import Interval, headline, statistic
 from impact_posture.output.plot.result_view import number
 from impact_posture.output.plot.run_view import RunView, run_header
 from impact_posture.output.report.report_page import Content, Table
@@ -65,9 +65,9 @@ def run_content(folder: Path, document: Document, view: RunView, job: Job) -> Co
     if document["prediction"] is not None:
         H = number(document["prediction"]["H"])
         rows.append(("H before", H, "jump²/(N·s)²", "jump² per impulse² at the impacts"))
-        # Runs of older versions do not contain the loads.
-        if document["prediction"].get("measured_impact") is not None:
-            tables.append(_load_table(document["prediction"], view))
+        if loads := load_rows(document["prediction"]):
+            title = "In the pushes" if view.pushed else f"Within {AFTER_TOUCH}"
+            tables.append(Table(title, ("", "measured", "rigid prediction", "unit", "meaning"), tuple(loads)))
     return Content(
         title=run_header([view])[0],
         command=typed_command(folder) or shlex.join(["impact-posture", *options]),
@@ -85,12 +85,14 @@ def table_metrics(view: RunView) -> list[tuple[str, str, str]]:
     return [(key, unit, meanings.get(key, meaning)) for key, unit, meaning in _METRICS]
 
 
-def _load_table(prediction: Mapping[str, Any], view: RunView) -> Table:
-    """Return the table of the effects on base, joints and contact, as measured and as predicted."""
+def load_rows(prediction: Mapping[str, Any]) -> list[tuple[str, str, str, str, str]]:
+    """Return key, measured and predicted value, unit and meaning of each known effect on base, joints and contact."""
+    # Runs of older versions do not contain the loads.
+    if prediction.get("measured_impact") is None:
+        return []
     measured, predicted = (_load_cells(prediction[f"{key}_impact"]) for key in ("measured", "predicted"))
-    title = "In the pushes" if view.pushed else f"Within {AFTER_TOUCH}"
     rows = [(key, measured[key], predicted[key], unit, meaning) for key, unit, meaning in _LOADS]
-    return Table(title, ("", "measured", "rigid prediction", "unit", "meaning"), tuple(rows))
+    return [row for row in rows if row[1] != "–"]
 
 
 def _load_cells(load: Mapping[str, Any]) -> dict[str, str]:
@@ -122,17 +124,14 @@ def comparison_content(folder: Path, document: Document, view: RunView) -> Conte
         "Within the impact windows, against nominal:", *(headline(row, nominal) for row in compared)
     ]  # fmt: skip
     seeds = len(document["seeds"])
-    alike = without_noise(Interval(**interval) for row in rows for interval in row["metrics"].values())
-    intervals = ", with 95 % intervals" if seeds >= FEWEST else ""
-    intervals = ", all alike, because the scenario has no noise" if alike else intervals
-    means = "One seed" if seeds == 1 else f"Means of {seeds} seeds{intervals}"
+    means = statistic(seeds, [Interval(**interval) for row in rows for interval in row["metrics"].values()])
     command = ["impact-posture", "compare", view.scenario, "--controllers", ",".join(labels), "--seeds", str(seeds)]
     return Content(
         title=f"{document['scenario']}: {', '.join(labels)}",
         command=typed_command(folder) or shlex.join(command),
         facts=tuple(run_header([view])[1]),
         verdict=(*lines, *(f"{row['controller']}: {reason}" for row in rows for reason in row["failed"])),
-        tables=(Table(means, ("", *labels, "unit", "meaning"), tuple(table)),),
+        tables=(Table(means.capitalize(), ("", *labels, "unit", "meaning"), tuple(table)),),
         moves=f"{_MOVES} The runs have the first seed.",
         notes=(),
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -19,6 +19,8 @@ from impact_posture.simulation.outcome import Outcome, gravest
 _OTHERS = ("stops", "contacts", "contacts_asked", "rested", "joint")
 QUANTITIES = (*(f.name for f in fields(Metrics) if f.name not in _OTHERS), "joint_velocity", "joint_share")
 
+# Confidence of the intervals.
+CONFIDENCE = 0.95
 # An interval is shown only for at least this number of samples.  For two samples, the quantile of Student's t is
 # 12.7, so the interval is too wide to be useful.
 FEWEST = 3
@@ -28,7 +30,7 @@ _SAME = 1e-12
 
 @dataclass(frozen=True)
 class Interval:
-    """Mean with its 95 % confidence interval (Student's t).
+    """Mean with its interval of the confidence :data:`CONFIDENCE` (Student's t).
 
     Attributes:
         mean: Mean of the samples.
@@ -54,14 +56,21 @@ class Interval:
     def of(values: Sequence[float]) -> Interval:
         """Return the mean and interval of one or more samples."""
         n = len(values)
-        half_width = float(stdtrit(n - 1, 0.975) * np.std(values, ddof=1) / np.sqrt(n)) if n > 1 else None
-        return Interval(float(np.mean(values)), half_width, n)
+        if n == 1:
+            return Interval(float(values[0]), None, 1)
+        half_width = stdtrit(n - 1, (1 + CONFIDENCE) / 2) * np.std(values, ddof=1) / np.sqrt(n)
+        return Interval(float(np.mean(values)), float(half_width), n)
 
 
-def without_noise(intervals: Iterable[Interval]) -> bool:
-    """Return whether all intervals are ``alike``, so the scenario has no noise; false without intervals."""
-    alike = [interval.alike for interval in intervals]
-    return bool(alike) and all(alike)
+def statistic(seeds: int, intervals: Sequence[Interval]) -> str:
+    """Return in words what the numbers with these intervals, over ``seeds`` seeds, are."""
+    if seeds == 1:
+        return "one seed, so there are no intervals"
+    means = f"means of {seeds} seeds"
+    if intervals and all(interval.alike for interval in intervals):
+        return f"{means}, all alike, because the scenario has no noise"
+    shown = f"± half of the {100 * CONFIDENCE:g} % confidence interval"
+    return f"{means} {shown}" if seeds >= FEWEST else f"{means} (intervals from {FEWEST} seeds on)"
 
 
 @dataclass(frozen=True)

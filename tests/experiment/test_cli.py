@@ -113,8 +113,8 @@ def test_simulate_prints_a_summary(push: Path, tmp_path: Path) -> None:
     run = json.loads((tmp_path / "solo8-push-robust-held" / "run.json").read_text())
     assert run["metrics"]["impulse"] == pytest.approx(6.5 * 0.4)
     words = " ".join(done.stdout.split())
-    assert "measured rigid prediction" in words and "normal impulse 2.6 N·s 2.6 N·s" in words
-    assert f"{run['metrics']['joint']['name']} {run['metrics']['joint']['velocity']:.4g} rad/s, " in words
+    assert "measured rigid prediction unit" in words and "impulse 2.6 2.6 N·s" in words
+    assert f"{run['metrics']['joint']['name']}: {run['metrics']['joint']['velocity']:.3g} rad/s" in words
     assert max(len(line) for line in done.stdout.splitlines()) <= 80
     assert (tmp_path / "solo8-push-robust-held" / "series-minus.npz").is_file()
 
@@ -231,7 +231,9 @@ def test_compare(aerial: Path, tmp_path: Path) -> None:
     page = (tmp_path / "both" / "report.html").read_text()
     assert "default-src 'none'" in page and len(page) < 2e6
     assert all(f'<option value="{k}">{name}</option>' in page for k, name in enumerate(("nominal", "robust")))
-    assert "Means of 2 seeds</caption>" in page and "±" not in page, "intervals need 3 seeds, as on the terminal"
+    assert "Means of 2 seeds (intervals from 3 seeds on)</caption>" in page and "±" not in page, (
+        "intervals need 3 seeds, as on the terminal"
+    )
 
 
 def test_reproduce(tmp_path: Path) -> None:

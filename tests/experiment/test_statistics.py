@@ -25,7 +25,7 @@ from impact_posture.experiment.reproduction import (
     missed_targets,
 )
 from impact_posture.experiment.reproduction_summary import advice, remarks, scenario_table, summary, table_one
-from impact_posture.experiment.seed_statistics import QUANTITIES, Interval, fate, headline, row_of, without_noise
+from impact_posture.experiment.seed_statistics import QUANTITIES, Interval, fate, headline, row_of, statistic
 from impact_posture.impact.evaluation.impact_effect import ImpactLoad, WorstJoint
 from impact_posture.simulation.controllers.controller_factory import CONTROLLERS, MEANING
 from impact_posture.simulation.metrics import Metrics
@@ -61,7 +61,11 @@ def test_interval_follows_students_t() -> None:
     # Without sensor noise, runs differ only by rounding.
     same = Interval.of([0.1 + 0.2, 0.3, 0.3])
     assert same.alike and same.shown is None and not interval.alike
-    assert without_noise([same, same]) and not without_noise([same, interval]) and not without_noise([])
+    assert statistic(3, [same, same]) == "means of 3 seeds, all alike, because the scenario has no noise"
+    assert statistic(3, [same, interval]) == "means of 3 seeds ± half of the 95 % confidence interval"
+    assert statistic(2, []) == "means of 2 seeds (intervals from 3 seeds on)" and statistic(1, []).startswith(
+        "one seed"
+    )
 
 
 def test_reductions_are_paired_by_seed() -> None:
