@@ -44,7 +44,8 @@ def _check_prefix(prefix: str | None) -> str | None:
 
 
 RobotName = Annotated[
-    str, typer.Argument(metavar="ROBOT", help="Known name, path to a URDF or MJCF, or example-robot-data:PATH.")
+    str,
+    typer.Argument(metavar="ROBOT", help="Known name, path to a URDF, xacro file or MJCF, or COLLECTION:NAME."),
 ]
 RobotOrResult = Annotated[
     str, typer.Argument(metavar="ROBOT|RESULT_DIR", help="A robot, or a folder that optimize wrote.")

@@ -25,7 +25,7 @@ RobotOrProblem = Annotated[
     str,
     typer.Argument(
         metavar="ROBOT|PROBLEM.toml",
-        help="Known name, path to a URDF or MJCF, example-robot-data:PATH, or problem.",
+        help="Robot as in 'robots': name, file or COLLECTION:NAME; or a problem.",
     ),
 ]
 

@@ -7,11 +7,12 @@ from impact_posture_cli.output import Page, print_json
 
 
 def robots(json: options.Json = False, quiet: options.Quiet = False) -> None:
-    from impact_posture.robot.robot_summary import WAYS_TO_NAME, catalogue
+    from impact_posture.robot.robot_collections import ways_to_name
+    from impact_posture.robot.robot_summary import catalogue
 
     entries = catalogue()
     if json:
-        print_json({"robots": entries, "ways_to_name": list(WAYS_TO_NAME)})
+        print_json({"robots": entries, "ways_to_name": list(ways_to_name())})
         return
     page = Page(quiet=quiet)
     page.table(
@@ -21,7 +22,7 @@ def robots(json: options.Json = False, quiet: options.Quiet = False) -> None:
     if not quiet:
         page.gap()
         page.line("ROBOT is one of:")
-        page.table((), [("  -", way) for way in WAYS_TO_NAME])
-        page.line("Models come from the example-robot-data package, except:")
+        page.table((), [("  -", way) for way in ways_to_name()])
+        page.line("Known models come from the example-robot-data package, except:")
         bundled = [e["name"] for e in entries if e["from"] != "example-robot-data"]
         page.line(f"  {', '.join(bundled)} (bundled with impact-posture). --json has every source.")

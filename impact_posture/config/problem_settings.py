@@ -34,7 +34,12 @@ from impact_posture.config.demand import Vector3 as Vector3
 from impact_posture.config.obstacle import Obstacle
 from impact_posture.config.setting import CONTACT, LIMITS, METRIC, ROBOT, SEARCH, TASK, Unstated, setting
 from impact_posture.config.table_validation import StrictTable
-from impact_posture.config.text_parsers import parse_armature, parse_number_or_name, parse_payloads
+from impact_posture.config.text_parsers import (
+    parse_armature,
+    parse_number_or_name,
+    parse_payloads,
+    parse_xacro_arguments,
+)
 
 Root = Literal["free-flyer", "fixed"]
 NormalFrame = Literal["world", "contact"]
@@ -82,6 +87,7 @@ class LoadOptions(StrictTable):
         srdf: SRDF file: a path, or ``example-robot-data:<path below robots/>``.
         package_dir: Folders in which ``package://`` paths are searched.  Only the meshes of
             collision shapes and pictures need these folders.
+        xacro_arg: Argument of a xacro file → its value; ``None`` selects the defaults of the file.
         mounting: Displacement of each named joint from its place in the URDF, m, in the axes of the parent joint.
     """
 
@@ -104,6 +110,10 @@ class LoadOptions(StrictTable):
     package_dir: tuple[str, ...] = setting(
         (), "Folder of package:// paths; repeatable.", ROBOT, "DIR", repeatable=True
     )
+    xacro_arg: Mapping[str, str] | None = setting(
+        None, "Argument of a xacro file; repeatable.", ROBOT, "NAME:=VALUE", "the file's defaults",
+        parse=parse_xacro_arguments, repeatable=True,
+    )  # fmt: skip
     mounting: Mapping[str, Vector3] = field(default_factory=dict)
 
 

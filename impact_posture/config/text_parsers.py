@@ -53,6 +53,17 @@ def parse_armature(texts: Sequence[str]) -> Mapping[str, float] | str | None:
     return values
 
 
+def parse_xacro_arguments(texts: Sequence[str]) -> Mapping[str, str]:
+    """Read texts ``NAME:=VALUE``; raise ``InputError`` for another form."""
+    values: dict[str, str] = {}
+    for text in texts:
+        name, sign, value = text.partition(":=")
+        if not (name and sign):
+            raise InputError(f"'{text}' is not NAME:=VALUE", where="xacro_arg", hint="for example hand:=true")
+        values[name] = value
+    return values
+
+
 def parse_payloads(texts: Sequence[str]) -> tuple[tuple[str, float], ...]:
     """Read texts ``FRAME:MASS``; the name of a frame may contain colons.
 

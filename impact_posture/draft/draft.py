@@ -17,6 +17,7 @@ from impact_posture.draft.toml_lines import Draft, comment_lines
 from impact_posture.errors import InertiaError, InputError, MjcfError, OutputError, UrdfError
 from impact_posture.robot import guessed_parts as guess
 from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_collections import COLLECTIONS
 from impact_posture.robot.robot_loader import Located, build_robot, known_robots, load_robot, locate
 from impact_posture.robot.robot_spec import SCHEMA, ModelSpec, RobotSpec, Support
 from impact_posture.robot.support_polygon import polygon_edges
@@ -37,7 +38,7 @@ def write_draft(robot: str, options: LoadOptions, out: Path | None, *, force: bo
     """Write a commented ``robot.toml`` that can be loaded without changes; return its path and its content.
 
     ``options`` are data from the user; other data are read or guessed.  By default, ``out`` is ``robot.toml`` beside
-    the URDF, or ``./<name>.toml`` for a URDF of example-robot-data.
+    the URDF or MJCF, or ``./<name>.toml`` for a robot of a collection.
 
     Raises:
         InputError: The robot is a known name, which has a ``robot.toml`` already.
@@ -48,8 +49,8 @@ def write_draft(robot: str, options: LoadOptions, out: Path | None, *, force: bo
         raise InputError("has its robot.toml already", where=robot, hint=hint)
     # The empty file os.devnull is read in place of a robot.toml beside the URDF.
     located = locate(robot, LoadOptions(config=os.devnull))
-    in_package = located.source.startswith(EXAMPLE_PREFIX)
-    out = out or (Path(f"{located.urdf.stem}.toml") if in_package else located.urdf.parent / "robot.toml")
+    in_package = located.source.startswith(COLLECTIONS)
+    out = out or (Path(f"{located.urdf.stem}.toml") if in_package else located.home / "robot.toml")
     check_name(out)
     if out.exists() and not force:
         raise OutputError("exists", where=str(out), hint="name another file, or `force` to replace it")
@@ -72,7 +73,7 @@ def write_draft(robot: str, options: LoadOptions, out: Path | None, *, force: bo
 
 def draft_spec(located: Located, options: LoadOptions, folder: Path) -> Draft:
     """Return the draft for a URDF, with paths relative to ``folder``."""
-    srdf = resolve_path(options.srdf, Path()) if options.srdf else guess.srdf_near(located.urdf)
+    srdf = resolve_path(options.srdf, Path()) if options.srdf else guess.srdf_near(located.home / located.urdf.name)
     try:
         robot = _load(located, options, options.root, srdf)
     except UrdfError as error:  # A fixed robot without joints cannot move.

@@ -29,9 +29,11 @@ from impact_posture.robot.inertia_checks import check_any_mass, check_mass_matri
 from impact_posture.robot.model_joints import immovable_joints, joint_index, movable_joints, q_slice, v_slice
 from impact_posture.robot.named_postures import ignored_bases, named_postures
 from impact_posture.robot.robot import CompiledMjcf, Robot
+from impact_posture.robot.robot_collections import COLLECTIONS, CollectedRobot, collected
 from impact_posture.robot.robot_description import read_description
 from impact_posture.robot.robot_spec import RobotSpec, read_spec
 from impact_posture.robot.urdf import EXAMPLE_PREFIX, example_models, resolve_path, robots_data
+from impact_posture.robot.xacro_file import expand_xacro
 from impact_posture.system.arrays import Array
 
 
@@ -42,10 +44,10 @@ def known_robots() -> tuple[str, ...]:
 
 @checked
 def load_robot(robot: str, options: LoadOptions | None = None, **settings: Any) -> Robot:
-    """Load a robot by known name, path to a URDF or MJCF, or ``example-robot-data:<path below robots/>``.
+    """Load a robot by its name or by the path of a URDF, xacro file or MJCF.
 
     Args:
-        robot: Name, path or URI.
+        robot: One of the forms of :func:`~impact_posture.robot.robot_collections.ways_to_name`.
         options: Options of loading.
         settings: Fields of :class:`~impact_posture.config.problem_settings.LoadOptions` in place of ``options``, for
             example ``root="fixed"``.
@@ -62,7 +64,7 @@ def load_robot(robot: str, options: LoadOptions | None = None, **settings: Any) 
 
 def build_robot(located: Located, options: LoadOptions) -> Robot:
     """Build the robot that a URDF or MJCF and a ``robot.toml`` describe; see :func:`load_robot` for errors."""
-    spec, urdf, source, base, name = located
+    spec, urdf, source, base, name, _ = located
     _check_package_dirs(options.package_dir, Path(), "package_dir")
     _check_package_dirs(spec.model.package_dirs, base, f"{name} robot.toml [model] package_dirs")
     described = read_description(urdf, options.root or spec.model.root, accept_inertias=spec.model.accept_inertias)
@@ -106,8 +108,8 @@ def _check_package_dirs(folders: Sequence[str], base: Path, where: str) -> None:
 
 
 def names_a_path(robot: str, folder: Path) -> bool:
-    """Return whether ``robot`` is a path (from ``folder``), not a known name or an example-robot-data URI."""
-    if robot.startswith(EXAMPLE_PREFIX) or robot in known_robots():
+    """Return whether ``robot`` is a path (from ``folder``), not a known name or a robot of a collection."""
+    if robot.startswith(COLLECTIONS) or robot in known_robots():
         return False
     return robot.endswith((".urdf", ".xml", ".xacro")) or "/" in robot or os.path.isfile(folder / robot)
 
@@ -133,13 +135,21 @@ def from_folder(data: dict[str, object], folder: Path, files: Sequence[str]) -> 
 
 
 class Located(NamedTuple):
-    """Files of a robot before its URDF is read; relative paths start from ``folder``."""
+    """Files of a robot before its URDF or MJCF is read.
+
+    Attributes:
+        urdf: The URDF or MJCF; for a xacro file, the URDF in the cache.
+        source: Name, path or URI in outputs.
+        folder: Folder from which relative paths in ``spec`` start.
+        home: Folder of the file that the user named.
+    """
 
     spec: RobotSpec
     urdf: Path
     source: str
     folder: Path
     name: str
+    home: Path
 
 
 def locate(robot: str, options: LoadOptions) -> Located:
@@ -157,20 +167,32 @@ def locate(robot: str, options: LoadOptions) -> Located:
             if chosen != urdf:
                 urdf = chosen
                 source = text if (text := spec.model.urdf or "").startswith(EXAMPLE_PREFIX) else str(urdf)
-        return Located(spec, urdf, source, base, spec.name or robot)
+        return Located(spec, urdf, source, base, spec.name or robot, urdf.parent)
     if robot.startswith(EXAMPLE_PREFIX):
-        urdf, source = resolve_path(robot, Path()), robot
+        files = CollectedRobot(resolve_path(robot, Path()))
+    elif robot.startswith(COLLECTIONS):
+        files = collected(robot)
     elif names_a_path(robot, Path()):
-        urdf, source = Path(robot).expanduser(), robot
+        files = CollectedRobot(Path(robot).expanduser())
     else:
         similar = [EXAMPLE_PREFIX + p for p in example_models() if robot.casefold() in Path(p).stem.casefold()]
-        raise RobotNotFound(robot, [*known_robots(), *similar], hint="(or give a path to a .urdf or an MJCF)")
-    config = Path(options.config) if options.config else urdf.parent / "robot.toml"
-    if options.config or (os.path.isfile(config) and EXAMPLE_PREFIX not in source):
+        raise RobotNotFound(robot, [*known_robots(), *similar], hint="(or give a path to a URDF or MJCF)")
+    home = files.path.parent
+    config = Path(options.config) if options.config else home / "robot.toml"
+    if options.config or (os.path.isfile(config) and not robot.startswith(COLLECTIONS)):
         spec, base = read_spec(config), config.parent
     else:
-        spec, base = RobotSpec(), urdf.parent
-    return Located(spec, urdf, source, base, spec.name or urdf.stem)
+        spec, base = RobotSpec(), home
+    folders = (*spec.model.package_dirs, *files.folders)
+    spec = replace(spec, model=replace(spec.model, package_dirs=folders, srdf=spec.model.srdf or files.srdf))
+    urdf = files.path
+    if urdf.suffix == ".xacro":
+        places = [Path(folder).expanduser() for folder in options.package_dir]
+        places += [base / Path(folder).expanduser() for folder in folders]
+        urdf = expand_xacro(urdf, {**files.arguments, **(options.xacro_arg or {})}, places, files.packages)
+    elif options.xacro_arg:
+        raise InputError("is not a xacro file", where=str(urdf), hint="leave `xacro_arg` out")
+    return Located(spec, urdf, robot, base, spec.name or urdf.stem, home)
 
 
 def srdf_path(spec: RobotSpec, options: LoadOptions, base: Path) -> Path | None:

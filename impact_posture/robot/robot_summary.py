@@ -16,12 +16,6 @@ from impact_posture.robot.robot_loader import known_robots
 from impact_posture.robot.robot_spec import PropulsionSpec, read_spec
 from impact_posture.robot.urdf import EXAMPLE_PREFIX, robots_data
 
-WAYS_TO_NAME = (
-    "a known name, as listed",
-    "a path to a URDF, or to an MJCF (.xml); a robot.toml beside it, or --config, adds data that the file lacks",
-    f"{EXAMPLE_PREFIX}<path below its robots/ folder>",
-)
-
 
 def catalogue() -> list[dict[str, Any]]:
     """Return a summary of each known robot; only its ``robot.toml`` is read."""

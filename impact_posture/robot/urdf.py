@@ -172,7 +172,7 @@ def parse_urdf(path: Path) -> ET.Element:
         raise UrdfError("has no <link>", where=str(path), hint="expand xacro first, or give the .urdf")
     if leftover := _xacro_leftover(root):
         fault = f"contains {leftover}, which only xacro can evaluate"
-        raise UrdfError(fault, where=str(path), hint="expand it: xacro FILE > FILE.urdf")
+        raise UrdfError(fault, where=str(path), hint="name the file .xacro")
     return root
 
 

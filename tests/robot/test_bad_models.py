@@ -107,9 +107,9 @@ def test_files_that_are_no_robot(
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ('value="1"', 'value="${m}"', ("'${m}' in <mass value>", "xacro FILE")),
-        ('upper="1"', 'upper="$(arg reach)"', ("'$(arg reach)' in <limit upper>", "xacro FILE")),
-        ("<robot name='bad'>", "<robot name='bad'><xacro:arm side='left'/>", ("<xacro:arm>", "xacro FILE")),
+        ('value="1"', 'value="${m}"', ("'${m}' in <mass value>", "name the file .xacro")),
+        ('upper="1"', 'upper="$(arg reach)"', ("'$(arg reach)' in <limit upper>", "name the file .xacro")),
+        ("<robot name='bad'>", "<robot name='bad'><xacro:arm side='left'/>", ("<xacro:arm>", "name the file .xacro")),
         ('value="1"', 'value="1,5"', ("link 'a': mass value='1,5' is not a number", "correct it")),
         ('ixx="0.01"', "", ("link 'a': inertia ixx='' is not a number", "correct it")),
         ('xyz="0.1 0.2 0.3"', 'xyz="0.1 0.2"', ("link 'b': origin xyz='0.1 0.2' is not 3 numbers", "correct it")),
