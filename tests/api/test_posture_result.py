@@ -16,7 +16,7 @@ import pytest
 import impact_posture as ip
 from impact_posture.errors import InputError, OutputError, PostureError, SpecError
 from impact_posture.output import plot
-from impact_posture.posture.formulation.problem_file import prepare
+from impact_posture.posture.formulation.problem_file import dump_settings, prepare, read_settings, resolved_settings
 from impact_posture.system.toolchain import find_compiler
 from tests.api.test_extension import JointDistance
 from tests.support.command import ALL_PICTURES, blank, run
@@ -104,7 +104,7 @@ def test_defaults_agree_with_the_command_line(
         ({}, "impulse"),
         ({"speed": 1.0}, "coulomb"),
         ({"speed": 0.0}, "impulse"),
-        ({"friction": 0.3}, "coulomb"),
+        ({"friction": 0.7}, "coulomb"),
         ({"friction": 0.0}, "speed"),
         ({"contact_stiffness": "wood"}, "coulomb"),
         ({"contact_duration": 0.01, "friction": 0.0}, "speed"),
@@ -113,8 +113,17 @@ def test_defaults_agree_with_the_command_line(
         ({"friction": 0.3, "objective": "energy"}, "energy"),
     ],
 )
-def test_a_stated_speed_selects_the_objective_as_on_the_command_line(stated: dict[str, Any], kind: str) -> None:
-    theirs = prepare(make_settings({"robot": "ur5", "frame": "tool0", "normal": (0.1, 0.2, 1.0)} | stated)).impact
+def test_a_stated_speed_friction_or_elasticity_selects_the_objective(
+    stated: dict[str, Any], kind: str, tmp_path: Path
+) -> None:
+    """Also a stated number that equals the default, on the command line, in Python, and in the problem on file."""
+    prepared = prepare(make_settings({"robot": "ur5", "frame": "tool0", "normal": (0.1, 0.2, 1.0)} | stated))
+    theirs, path = prepared.impact, tmp_path / "problem.toml"
+    assert ("(auto, because of `" in theirs.choice) == (bool(stated) and "objective" not in stated)
+    path.write_text(dump_settings(resolved_settings(prepared)))
+    again = prepare(read_settings(path))
+    assert again.impact.objective.kind == kind and not again.impact.choice
+    assert again.problem.describe() == prepared.problem.describe()
     task = {key: value for key, value in stated.items() if key in ("speed", "contact_stiffness", "contact_duration")}
     friction = {key: stated[key] for key in ("friction",) if key in stated}
     contact = ip.ImpactContact("tool0", (0.1, 0.2, 1.0), **friction)

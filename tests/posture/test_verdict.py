@@ -23,7 +23,6 @@ from impact_posture.posture.approach.approach_speed import ApproachSpeed
 from impact_posture.posture.formulation.problem_file import (
     dump_settings,
     prepare,
-    read_settings,
     resolved_settings,
 )
 from impact_posture.posture.search.multistart import solve
@@ -317,32 +316,6 @@ def test_another_objective_is_advised_only_if_it_minimizes_the_jump(
     assert told.outcome == "no better"
     advised = [line for line in told.advice if "minimizes this whole jump" in line]
     assert [line.split()[1] for line in advised] == ([] if better is None else [better])
-
-
-@pytest.mark.parametrize(
-    ("more", "kind"),
-    [
-        ({}, "impulse"),
-        ({"speed": 1.0}, "coulomb"),
-        ({"friction": 0.7}, "coulomb"),
-        ({"friction": 0.0}, "speed"),
-        ({"contact_stiffness": "wood"}, "coulomb"),
-        ({"contact_duration": 0.01}, "coulomb"),
-        ({"speed": 1.0, "objective": "impulse"}, "impulse"),
-    ],
-)
-def test_a_stated_speed_friction_or_elasticity_selects_auto(
-    more: dict[str, object], kind: str, tmp_path: Path
-) -> None:
-    """Also a stated number that equals the default.  The problem that is written has the same objective."""
-    prepared = prepare(make_settings({"robot": "panda", **NORMAL, **more}))
-    assert prepared.impact.objective.kind == kind
-    assert ("(auto, because of `" in prepared.impact.choice) == (bool(more) and "objective" not in more)
-    path = tmp_path / "problem.toml"
-    path.write_text(dump_settings(resolved_settings(prepared)))
-    again = prepare(read_settings(path))
-    assert again.impact.objective.kind == kind and not again.impact.choice
-    assert again.problem.describe() == prepared.problem.describe()
 
 
 @pytest.mark.parametrize(
