@@ -15,7 +15,7 @@ from impact_posture.codegen.export_functions import SIGNATURES, lengths
 from impact_posture.codegen.export_library import Exported, ExportLibrary, NamedObjective, export_library
 from impact_posture.codegen.expression_graph import ARITHMETIC, Graph
 from impact_posture.codegen.sum_order import reorder_sums
-from impact_posture.config.cached_values import read_stored, write_stored
+from impact_posture.config.cached_values import cached
 from impact_posture.system.libraries import source_key
 
 LARGEST_VECTOR = 64
@@ -77,11 +77,7 @@ def build_c_source(exported: Sequence[NamedObjective], prefix: str, real: Real, 
     ]
     content = (library.constants, library.seeds, library.functions, models, prefix, real, portable)
     key = source_key([ca.CasadiMeta.version(), repr(content), library.function.serialize()], "codegen")
-    code = read_stored("code", key, CSource)
-    if code is None:
-        code = _generate(exported, library, prefix, real, portable=portable)
-        write_stored("code", key, code)
-    return code
+    return cached("code", key, CSource, lambda: _generate(exported, library, prefix, real, portable=portable))
 
 
 def _generate(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import coal
 import numpy as np
@@ -14,7 +14,7 @@ from impact_posture.collision.coal_geometry import geometry_key, load_geometry, 
 from impact_posture.collision.shape_corners import ends, shape_points
 from impact_posture.collision.swept_hull import hull_corners
 from impact_posture.collision.urdf_shapes import UrdfShape
-from impact_posture.config.cached_values import StoredArray, read_stored, write_stored
+from impact_posture.config.cached_values import StoredArray, cached
 from impact_posture.config.demand import Vector3
 from impact_posture.robot.model_joints import rigid_groups
 from impact_posture.robot.robot import Robot
@@ -79,11 +79,6 @@ class Silhouette:
         return np.asarray((points[:, None] + rim[None]).reshape(-1, 3))
 
 
-@dataclass(frozen=True, eq=False)
-class _Silhouettes:
-    shapes: tuple[Silhouette, ...]
-
-
 def contact_front(
     robot: Robot,
     q: Array,
@@ -142,12 +137,9 @@ def rigid_silhouettes(robot: Robot, joint: int, held: tuple[str, ...] = ()) -> t
         return ()
     # Whether meshes with y up are turned depends on the shapes of all links.
     needed = described if any(shape.y_up for shape in near) else near
-    key = geometry_key(robot, needed)
-    stored = read_stored("silhouettes", key, _Silhouettes)
-    if stored is None:
-        stored = _Silhouettes(_silhouettes(robot, needed))
-        write_stored("silhouettes", key, stored)
-    return tuple(shape for shape in stored.shapes if group[shape.joint] == group[joint])
+    key, make = geometry_key(robot, needed), partial(_silhouettes, robot, needed)
+    stored = cached("silhouettes", key, tuple[Silhouette, ...], make)
+    return tuple(shape for shape in stored if group[shape.joint] == group[joint])
 
 
 def _joint(robot: Robot, link: str) -> int:

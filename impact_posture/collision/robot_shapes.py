@@ -16,7 +16,7 @@ from impact_posture.collision.joint_planes import JointPlanes, joint_planes
 from impact_posture.collision.shape_pairs import Pair, nested_pairs, pairs_of, touch_of, touching_by_design
 from impact_posture.collision.swept_hull import Fit, SweptHull, fit_hull
 from impact_posture.collision.urdf_shapes import UrdfShape
-from impact_posture.config.cached_values import StoredArray, read_stored, write_stored
+from impact_posture.config.cached_values import StoredArray, cached
 from impact_posture.errors import listed, one_line
 from impact_posture.robot.robot import Robot
 from impact_posture.system.progress import tell
@@ -106,14 +106,6 @@ class _Source:
         return (*self.warnings, *warnings, *words)
 
 
-@dataclass(frozen=True)
-class _LoadedShapes:
-    """Content of a cache file: links whose shapes can be used, and warnings from loading these shapes."""
-
-    links: tuple[str, ...]
-    warnings: tuple[str, ...]
-
-
 def _source(robot: Robot) -> _Source:
     read = read_shapes(robot)
     key = geometry_key(robot, read.shapes)
@@ -127,13 +119,14 @@ def shape_warnings(robot: Robot) -> tuple[str, ...]:
         UrdfError: As in :func:`load_shapes`.
     """
     source = _source(robot)
-    loaded = read_stored("loaded-shapes", source.key, _LoadedShapes)
-    if loaded is None:
+
+    def load() -> tuple[tuple[str, ...], ...]:
         tell("reading collision shapes")
         geometry = load_geometry(robot, source.described)
-        loaded = _LoadedShapes(tuple(dict.fromkeys(geometry.links)), geometry.warnings)
-        write_stored("loaded-shapes", source.key, loaded)
-    return source.all_warnings(loaded.links, loaded.warnings)
+        return tuple(dict.fromkeys(geometry.links)), geometry.warnings
+
+    links, warnings = cached("loaded-shapes", source.key, tuple[tuple[str, ...], ...], load)
+    return source.all_warnings(links, warnings)
 
 
 @lru_cache(maxsize=16)
@@ -147,10 +140,7 @@ def load_shapes(robot: Robot) -> RobotShapes:
 
 @lru_cache(maxsize=16)
 def _shapes(source: _Source) -> RobotShapes:
-    fitted = read_stored("shapes", source.key, FittedShapes)
-    if fitted is None:
-        fitted = fit_shapes(source.robot, source.described)
-        write_stored("shapes", source.key, fitted)
+    fitted = cached("shapes", source.key, FittedShapes, lambda: fit_shapes(source.robot, source.described))
     warnings, bare = source.all_warnings(fitted.links, fitted.warnings), source.without_shapes(fitted.links)
     return RobotShapes(**vars(fitted) | {"warnings": warnings}, robot=source.robot, without_shapes=bare)
 

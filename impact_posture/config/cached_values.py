@@ -1,12 +1,11 @@
-"""Store dataclasses in the user's cache.  Damaged files, and files that another user may write, are ignored."""
+"""Store values in the user's cache.  Damaged files, and files that another user may write, are ignored."""
 
 from __future__ import annotations
 
 import hashlib
 from base64 import b64decode, b64encode
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 from contextlib import suppress
-from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
@@ -37,28 +36,25 @@ StoredArray = Annotated[NDArray[Any], PlainValidator(_unpacked), PlainSerializer
 """Annotation of an array in a stored dataclass."""
 
 
-def read_stored(kind: str, key: str, cls: type[_Value]) -> _Value | None:
-    """Return the dataclass in the file ``<kind>/<key>.json`` of the cache, or ``None`` without a valid file."""
+def cached(kind: str, key: str, cls: type[_Value], make: Callable[[], _Value]) -> _Value:
+    """Return the value of the file ``<kind>/<key>.json`` in the cache; without a valid file, make and store it.
+
+    ``cls`` is the type of the value: a dataclass, or a tuple of dataclasses.  ``make`` computes the value.  If the
+    cache cannot be written, the value is only returned.
+    """
     with suppress(OSError, OutputError, TypeError, ValueError):
-        path = _path(kind, key)
+        path = cache_folder(kind) / f"{key}.json"
         check_private(path)
         if path.stat().st_size <= _LONGEST:
             seal, text = path.read_text(encoding="utf-8").split("\n", 1)
             if seal == _seal(text):
-                value: _Value = adapter(cls).validate_json(text)
-                return value
-    return None
-
-
-def write_stored(kind: str, key: str, value: Hashable) -> None:
-    """Store a dataclass in the file ``<kind>/<key>.json`` of the cache; do nothing if this is impossible."""
-    text = adapter(type(value)).dump_json(value).decode()
+                stored: _Value = adapter(cls).validate_json(text)
+                return stored
+    value = make()
+    text = adapter(cls).dump_json(value).decode()
     with suppress(OSError, OutputError):
-        write_whole(_path(kind, key), f"{_seal(text)}\n{text}")
-
-
-def _path(kind: str, key: str) -> Path:
-    return cache_folder(kind) / f"{key}.json"
+        write_whole(cache_folder(kind) / f"{key}.json", f"{_seal(text)}\n{text}")
+    return value
 
 
 def _seal(text: str) -> str:

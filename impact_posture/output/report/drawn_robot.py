@@ -16,7 +16,7 @@ from pydantic import PlainSerializer, PlainValidator
 from impact_posture.collision.coal_geometry import geometry_key, load_geometry, read_shapes
 from impact_posture.collision.shape_corners import Triangles, hull_surface, shape_points, surface_of
 from impact_posture.collision.urdf_shapes import UrdfShape
-from impact_posture.config.cached_values import StoredArray, read_stored, write_stored
+from impact_posture.config.cached_values import StoredArray, cached
 from impact_posture.errors import PackageNotFound
 from impact_posture.output.plot.skeleton import link_tip
 from impact_posture.robot.robot import Robot
@@ -133,10 +133,7 @@ def draw_robot(robot: Robot, meshes: bool = False) -> DrawnRobot:
     known = {shape.name: license_of(shape.mesh) for shape in described if shape.kind == "mesh"}
     hulls = {name for name, terms in known.items() if not (meshes or (terms and terms.allows))}
     key = source_key([geometry_key(robot, described), repr(sorted(hulls))], "report")
-    placed = read_stored("solids", key, PlacedSolids)
-    if placed is None:
-        placed = _placed_solids(robot, described, hulls)
-        write_stored("solids", key, placed)
+    placed = cached("solids", key, PlacedSolids, lambda: _placed_solids(robot, described, hulls))
     parts = [(joint, k, at, _color(by_name[name])) for name, joint, k, at in placed.places]
     drawn = {name for name, *_ in placed.places}
     licenses = {terms.package: terms for name, terms in known.items() if terms and name in drawn - hulls}
