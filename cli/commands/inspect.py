@@ -98,7 +98,14 @@ def _head(page: Page, summary: dict[str, Any]) -> None:
     rows.append(("constraints", _constraints(summary["constraints"])))
     if summary["locked"]:
         rows.append(("locked joints", ", ".join(summary["locked"])))
+    if summary["couplings"]:
+        rows.append(("coupled joints", "; ".join(map(_coupling, summary["couplings"]))))
     page.pairs(rows)
+
+
+def _coupling(coupling: dict[str, Any]) -> str:
+    offset = f" {coupling['offset']:+.4g}" if coupling["offset"] else ""
+    return f"{coupling['follower']} = {coupling['ratio']:.4g} {coupling['leader']}{offset}"
 
 
 def _contact(contact: dict[str, Any]) -> str:

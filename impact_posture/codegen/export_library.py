@@ -113,8 +113,9 @@ def export_library(exported: Sequence[NamedObjective]) -> ExportLibrary:
     ``V``, and an ``objective`` that is a multiple of ``H``, have no expression, because the C code computes both from
     ``H`` and ``G``.
     """
-    model = exported[0].objective.robot.model
-    q, n, limbs = ca.SX.sym("q", model.nq), ca.SX.sym("n", 3), RepeatedLimbs(model)
+    robot = exported[0].objective.robot
+    model, coupled = robot.model, {joint for c in robot.couplings for joint in (c.follower, c.leader)}
+    q, n, limbs = ca.SX.sym("q", model.nq), ca.SX.sym("n", 3), RepeatedLimbs(model, coupled)
     outputs: dict[str, ca.SX] = {}
     functions: list[Exported] = []
     for number, v in enumerate(exported):

@@ -124,7 +124,7 @@ def random_postures(robot: Robot, count: int) -> Iterator[Array]:
     for _ in range(count):
         q = np.array(pin.integrate(model, start, random.uniform(-np.pi, np.pi, model.nv)))
         q[bounded] = random.uniform(np.minimum(low, high), high)[bounded]
-        yield q
+        yield robot.coupled(q)
 
 
 def disabled_links(robot: Robot) -> set[frozenset[str]]:

@@ -233,10 +233,10 @@ def _support_depth(robot: Robot, feet: Sequence[Support]) -> float:
 
 def _constraints(draft: Draft, robot: Robot, feet: Sequence[Support], carrying: Sequence[str]) -> None:
     free = [joint for joint in robot.joint_names if joint not in carrying]
-    hold = [joint for joint in free if joint in robot.mimics or joint in guess.fingers(robot)]
+    hold = [joint for joint in free if joint in guess.fingers(robot)]
     keys = Draft()
     if hold:
-        keys.key("hold", hold, "fingers and grippers by their names, joints that mimic others", guessed=True)
+        keys.key("hold", hold, "fingers and grippers by their names", guessed=True)
     if robot.floating and not feet:
         keys.key("level_base", True, "it floats, upright", guessed=True)
     if feet:

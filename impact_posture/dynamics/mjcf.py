@@ -28,6 +28,8 @@ Geom = Literal["sphere", "box", "plane"]
 WORLD = 0
 # Smallest mass (kg) and moment of inertia (kg m²) of a moving body that MuJoCo accepts.
 _LEAST = 1e-15
+# Impedance (solimp) of couplings: the largest that MuJoCo accepts.
+_STIFF = (0.9999, 0.9999, 1e-4, 0.5, 2.0)
 # With these options MuJoCo does not change inertias and does not merge bodies.
 _COMPILER = {
     "degree": False,
@@ -86,6 +88,15 @@ class Mjcf:
         self.body(joint).add_geom(
             name=name, type=import_mujoco().mjtGeom.mjGEOM_MESH, meshname=name, mass=0.0, contype=0, conaffinity=0
         )
+
+    def couple(self, follower: int, leader: int, ratio: float, offset: float) -> None:
+        """Let a joint follow another joint, ``q_follower = ratio · q_leader + offset``, as stiffly as MuJoCo can."""
+        mujoco = import_mujoco()
+        names = (self.joints[joint][0] for joint in (follower, leader))
+        data = np.array([offset, ratio, *np.zeros(10)])
+        equality = self.spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, objtype=mujoco.mjtObj.mjOBJ_JOINT, data=data)
+        equality.name1, equality.name2 = names
+        equality.solref, equality.solimp = (2 * self.spec.option.timestep, 1.0), _STIFF
 
     def add_plane(self, name: str, point: Array, normal: Array) -> None:
         """Add an infinite plane to the world through ``point`` with unit ``normal``, in world axes, shape (3,)."""

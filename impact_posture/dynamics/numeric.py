@@ -92,15 +92,15 @@ class Numeric:
         return np.asarray(self.jacobian(point)[3:].T @ _cross(direction, covector))
 
 
-def hold_locked(locked: NDArray[np.bool_], M: Array, *jacobians: Array) -> tuple[Array, ...]:
-    """Return ``M`` and the Jacobians with zero rows and columns at the locked entries.
+def reduced(P: Array, M: Array, *jacobians: Array) -> tuple[Array, ...]:
+    """Return ``PᵀMP`` and ``J P`` for the projector ``P`` of a robot (:attr:`Robot.projector`).
 
-    The diagonal of ``M`` is set to one at the locked entries, so ``M`` can still be inverted.
+    The diagonal of ``PᵀMP`` is set to one at the entries that ``P`` ignores, so that the matrix can be inverted.
     """
-    if not locked.any():
+    ignored = ~P.any(axis=0)
+    if not ignored.any():
         return M, *jacobians
-    mobile = ~locked
-    return np.where(np.outer(mobile, mobile), M, np.diag(locked.astype(float))), *(J * mobile for J in jacobians)
+    return P.T @ M @ P + np.diag(ignored.astype(float)), *(J @ P for J in jacobians)
 
 
 @cache

@@ -6,7 +6,7 @@ instructions compute all limbs.  A processor then computes several limbs at once
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 import casadi as ca
@@ -49,8 +49,10 @@ class RepeatedLimbs:
         parameters: (group, lane, name) → symbol and value of a parameter.  The name is the same for all lanes.
     """
 
-    def __init__(self, model: pin.Model) -> None:
-        self.groups = _groups(model)
+    def __init__(self, model: pin.Model, coupled: Collection[str] = ()) -> None:
+        # A coupling distinguishes the limbs with the joints ``coupled`` from the other limbs of their group.
+        groups = _groups(model)
+        self.groups = tuple(g for g in groups if not any(model.names[k] in coupled for limb in g for k in limb))
         self.places = {
             joint: Place(g, lane, position)
             for g, limbs in enumerate(self.groups)

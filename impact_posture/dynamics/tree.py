@@ -7,15 +7,18 @@ directions to link coordinates.  Notation and signs follow Featherstone, *Rigid 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import casadi as ca
 import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
 
 from impact_posture.dynamics import tree_steps as step
 from impact_posture.dynamics.kinematics import ByJoint, Kinematics, PointOnLink
+from impact_posture.dynamics.repeated_limbs import RepeatedLimbs
 from impact_posture.dynamics.spatial import (
     constant,
     cross,
@@ -29,6 +32,8 @@ from impact_posture.dynamics.spatial import (
 __all__ = ["ByJoint", "PointOnLink", "Response", "Tree", "Wrench"]
 
 _ZERO = ca.SX(6, 1)
+# Entry of a follower in ν, entry of its leader, and ratio.
+Coupled = tuple[int, int, float]
 
 
 @dataclass(frozen=True)
@@ -68,9 +73,35 @@ class Response:
     passed: ByJoint
     wrenches: tuple[Wrench, ...]
 
+    def minus(self, factors: ca.SX, others: Sequence[Response]) -> Response:
+        """Subtract ``Σ factors[k] · others[k]``, for responses to generalized forces without wrenches."""
+
+        def part(name: str) -> ByJoint:
+            mine, theirs = getattr(self, name), [getattr(other, name) for other in others]
+            return {i: mine[i] - sum(factors[k] * their[i] for k, their in enumerate(theirs)) for i in mine}
+
+        a = self.a - ca.horzcat(*[other.a for other in others]) @ factors
+        return Response(a, part("velocities"), part("before"), part("forces"), part("passed"), self.wrenches)
+
 
 class Tree(Kinematics):
-    """Dynamics of a model; the arguments are as for :class:`~impact_posture.dynamics.kinematics.Kinematics`."""
+    """Dynamics of a model; most arguments are as for :class:`~impact_posture.dynamics.kinematics.Kinematics`.
+
+    ``couplings`` are (entry of the follower in ν, entry of the leader, ratio) of coupled joints, which
+    :meth:`respond` considers.
+    """
+
+    def __init__(
+        self,
+        model: pin.Model,
+        q: ca.SX,
+        chart_x: ca.SX | None = None,
+        extra_inertia: Mapping[int, NDArray[np.float64]] | None = None,
+        limbs: RepeatedLimbs | None = None,
+        couplings: Sequence[Coupled] = (),
+    ) -> None:
+        super().__init__(model, q, chart_x, extra_inertia, limbs)
+        self._couplings = tuple(couplings)
 
     def velocities(self, v: ca.SX) -> ByJoint:
         """Return the spatial velocity of every link, in link coordinates, for the generalized velocity ``v``."""
@@ -171,8 +202,38 @@ class Tree(Kinematics):
     def respond(self, tau: ca.SX | None = None, wrenches: Sequence[Wrench] = ()) -> Response:
         """Solve ``M a = τ + Σ Jᵀ w`` by the articulated-body factorization in O(n), without computing ``M``.
 
-        The same sweeps give the force through joint i, ``f_i = I^a_i v_i⁻ + p^a_i``.
+        The same sweeps give the force through joint i, ``f_i = I^a_i v_i⁻ + p^a_i``.  Couplings add a torque ``Kᵀμ``
+        such that ``K a = 0``, where each row of K is 1 at a follower and minus the ratio at its leader.
         """
+        free = self._free_response(tau, wrenches)
+        if not self._couplings:
+            return free
+        gaps = ca.vertcat(*[self._gap(free, k) for k in range(len(self._couplings))])
+        return free.minus(step.solve(self._coupling_mobility, gaps), self._coupling_responses)
+
+    def _gap(self, response: Response, k: int) -> ca.SX:
+        follower, leader, ratio = self._couplings[k]
+        return response.a[follower] - ratio * response.a[leader]
+
+    @cached_property
+    def _coupling_responses(self) -> list[Response]:
+        """Responses ``M⁻¹Kᵀ`` to unit torques between each follower and its leader."""
+        responses = []
+        for follower, leader, ratio in self._couplings:
+            tau = ca.SX(self.nv, 1)
+            tau[follower], tau[leader] = 1.0, -ratio
+            responses.append(self._free_response(tau, ()))
+        return responses
+
+    @cached_property
+    def _coupling_mobility(self) -> ca.SX:
+        """``K M⁻¹Kᵀ``; for one coupling, its inverse."""
+        count = range(len(self._couplings))
+        mobility = ca.blockcat([[self._gap(self._coupling_responses[j], i) for j in count] for i in count])
+        return 1 / mobility if mobility.is_scalar() else mobility
+
+    def _free_response(self, tau: ca.SX | None, wrenches: Sequence[Wrench]) -> Response:
+        """Return the response without couplings."""
         bias: ByJoint = dict.fromkeys(self._R, _ZERO)
         for wrench in wrenches:
             bias[wrench.point.joint] = bias[wrench.point.joint] - self.link_force(wrench)

@@ -21,7 +21,7 @@ def pivot(inertia: ca.SX, S: ca.SX, armature: ca.SX) -> ca.SX:
 def reduce(inertia: ca.SX, S: ca.SX, pivot: ca.SX) -> tuple[ca.SX, ...]:
     """Return the gain ``D⁻¹SᵀI``, shape (nv, 6), and the inertia passed to the parent, ``I − I S D⁻¹SᵀI``."""
     U = inertia @ S
-    gain = _solve(pivot, U.T)
+    gain = solve(pivot, U.T)
     return gain, symmetric(inertia - U @ gain)
 
 
@@ -41,7 +41,7 @@ def respond(
     ``before`` is the velocity of the link without the motion of the joint.  The other arguments are results of
     :func:`drive` and :func:`reduce`.
     """
-    rates = _solve(pivot, drive) - gain @ before
+    rates = solve(pivot, drive) - gain @ before
     return rates, before + S @ rates, reduced @ before + passed
 
 
@@ -54,7 +54,7 @@ def gradient(S: ca.SX, turning: ca.SX, known: ca.SX, *pairs: ca.SX) -> ca.SX:
     return row
 
 
-def _solve(pivot: ca.SX, rhs: ca.SX) -> ca.SX:
+def solve(pivot: ca.SX, rhs: ca.SX) -> ca.SX:
     """Return ``D⁻¹ rhs``; for a joint with several axes, by an ``LDLᵀ`` factorization without pivoting."""
     if pivot.is_scalar():
         return pivot * rhs

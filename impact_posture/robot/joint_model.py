@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from impact_posture.config.problem_settings import JointModel
 from impact_posture.errors import InputError
 from impact_posture.robot.inertia_checks import check_mass_matrix
+from impact_posture.robot.joint_coupling import with_partners
 from impact_posture.robot.model_joints import joint_index, v_slice
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_spec import JointTransmissionSpec
@@ -58,6 +59,8 @@ def transmissions(robot: Robot) -> Transmissions:
         result.rigid[entries], result.locked[entries] = kind == "rigid", kind == "locked"
         result.stiffness[entries] = table.stiffness or spec.stiffness or np.inf
         result.damping[entries] = spec.damping if table.damping is None else table.damping
+    # The spring of a coupled joint lies between the motor and the leader.
+    result.stiffness[robot.followers] = np.inf
     return result
 
 
@@ -94,6 +97,10 @@ def with_joint_model(robot: Robot, joint_model: JointModel) -> Robot:
             raise InputError(fault, where="joint_model", hint=hint)
         armature = np.where(springs, 0.0, armature)
     armature[table.locked] = np.inf
+    entries = {joint: v_slice(robot.model, robot.joint_id(joint)) for joint in robot.joint_names}
+    held = [joint for joint, of_joint in entries.items() if np.isinf(armature[of_joint]).all()]
+    for joint in with_partners(robot.couplings, held):
+        armature[entries[joint]] = np.inf
     if (np.isinf(armature) | ~joints).all() and not robot.floating:
         fault = f"all joints of {robot.name} are locked, so nothing moves in an impact"
         raise InputError(fault, where="joint_model", hint="choose reflected or link")

@@ -1,4 +1,4 @@
-"""Compile an MJCF with the compiler of MuJoCo, and refuse what a model without coupled joints cannot contain."""
+"""Compile an MJCF with the compiler of MuJoCo, and refuse what a tree with coupled joints cannot contain."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from impact_posture.config.problem_settings import Root
 from impact_posture.errors import MjcfError
+from impact_posture.robot.joint_coupling import JointCoupling, composed
 from impact_posture.robot.urdf import MOST_DEGREES_OF_FREEDOM
 from impact_posture.system.arrays import Array
 from impact_posture.system.optional_package import import_mujoco, unwarned
@@ -25,14 +26,14 @@ class MjcfFile(NamedTuple):
         model: The ``mujoco.MjModel`` on the chosen root.
         root: ``free-flyer`` if the model has a free joint, else ``fixed``.
         keyframes: Name of a keyframe → name of a joint → its entries in ``qpos``.
-        couplings: Joint → joint on which an equality constraint makes it depend.
+        couplings: Couplings of joints by equality constraints.
         notes: Warnings about content that has no effect here, one line each.
     """
 
     model: Any
     root: Root
     keyframes: dict[str, dict[str, Array]]
-    couplings: dict[str, str]
+    couplings: tuple[JointCoupling, ...]
     notes: tuple[str, ...]
 
 
@@ -49,7 +50,7 @@ def read_mjcf(path: Path, root: Root | None) -> MjcfFile:
     """Compile an MJCF.  ``root`` adds or removes the free joint; ``None`` keeps the root of the file.
 
     Raises:
-        MjcfError: MuJoCo rejects the file, or the file couples joints by loops or tendons.
+        MjcfError: MuJoCo rejects the file, or the file couples joints by loops, tendons or polynomials.
         InputError: MuJoCo is not installed.
     """
     mujoco = import_mujoco()
@@ -168,19 +169,33 @@ def _check_tree(model: Any, path: Path) -> None:
         )
 
 
-def _couplings(model: Any, path: Path) -> dict[str, str]:
-    """Return the joints coupled by equality constraints; raise an error for loops and for tendons that couple joints.
+def equated_joints(model: Any) -> dict[int, Array]:
+    """Return the joints that equality constraints couple: joint → other joint (−1 for none) and polynomial, (6,)."""
+    joint = import_mujoco().mjtEq.mjEQ_JOINT
+    active = np.flatnonzero(model.eq_active0 & (model.eq_type == joint))
+    return {int(model.eq_obj1id[k]): np.r_[model.eq_obj2id[k], model.eq_data[k, :5]] for k in active}
 
-    A joint that an equality constraint holds at a constant depends on itself.
+
+def _couplings(model: Any, path: Path) -> tuple[JointCoupling, ...]:
+    """Return the couplings by equality constraints; raise an error for loops, tendons and polynomials.
+
+    The constraint is ``q − q⁰ = a₀ + a₁ (q' − q'⁰) + …`` with the positions ``q⁰``, ``q'⁰`` in ``qpos0``.  A joint
+    that a constraint holds at a constant gets equal limits.
     """
-    mujoco, couplings = import_mujoco(), dict[str, str]()
-    for k in np.flatnonzero(model.eq_active0):
+    mujoco, couplings = import_mujoco(), dict[str, JointCoupling]()
+    for first, (second, constant, ratio, *curved) in equated_joints(model).items():
+        name, start = object_name(model, "joint", first), model.qpos0[model.jnt_qposadr[first]]
+        if second < 0:
+            model.jnt_limited[first], model.jnt_range[first] = 1, start + constant
+        elif any(curved):
+            hint = f"make it linear {_STATED}, or remove it and `lock` the joint"
+            raise MjcfError(f"joint '{name}' follows another by a polynomial", where=str(path), hint=hint)
+        else:
+            other = int(second)
+            offset = start + constant - ratio * model.qpos0[model.jnt_qposadr[other]]
+            couplings[name] = JointCoupling(name, object_name(model, "joint", other), float(ratio), float(offset))
+    for k in np.flatnonzero(model.eq_active0 & (model.eq_type != mujoco.mjtEq.mjEQ_JOINT)):
         kind = mujoco.mjtEq(int(model.eq_type[k])).name.removeprefix("mjEQ_").lower()
-        first, second = int(model.eq_obj1id[k]), int(model.eq_obj2id[k])
-        if kind == "joint":
-            name = object_name(model, "joint", first)
-            couplings[name] = object_name(model, "joint", second) if second >= 0 else name
-            continue
         name = object_name(model, "equality", int(k))
         what = "couples joints by tendons" if kind == "tendon" else "closes a kinematic loop"
         hint = f"remove it {_STATED}, if the impact can do without, and `lock` or hold the joints that it guides"
@@ -188,7 +203,7 @@ def _couplings(model: Any, path: Path) -> dict[str, str]:
     for name in _coupling_armatures(model):
         hint = f"remove its armature {_STATED}, or move it to the joints"
         raise MjcfError(f"the armature of {name} couples joints", where=str(path), hint=hint)
-    return couplings
+    return composed(couplings, str(path))
 
 
 def _coupling_armatures(model: Any) -> Iterator[str]:

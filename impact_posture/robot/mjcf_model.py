@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.robot.mjcf_file import drives_joint, is_floating, object_name
+from impact_posture.robot.mjcf_file import drives_joint, equated_joints, is_floating, object_name
 from impact_posture.robot.model_joints import q_slice
 from impact_posture.system.arrays import Array
 from impact_posture.system.optional_package import import_mujoco
@@ -88,7 +88,9 @@ def _joint(mjcf: Any, j: int) -> tuple[pin.JointModel, pin.SE3, pin.SE3]:
     if mjcf.jnt_type[j] == types.mjJNT_SLIDE:
         family, back = "P", pin.SE3(np.eye(3), -reference * axis)
     else:
-        family = "R" if mjcf.jnt_limited[j] else "RUB"
+        # A coupled joint depends on the whole angle, not only on its cosine and sine.
+        equated = any(j in (joint, other[0]) for joint, other in equated_joints(mjcf).items())
+        family = "R" if mjcf.jnt_limited[j] or equated else "RUB"
         back = pin.SE3(pin.AngleAxis(-reference, axis).matrix(), np.zeros(3))
     if axis.max() == 1.0:
         kind = getattr(pin, f"JointModel{family}{'XYZ'[int(axis.argmax())]}")()

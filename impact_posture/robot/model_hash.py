@@ -4,35 +4,38 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pinocchio as pin
 
+from impact_posture.robot.joint_coupling import JointCoupling
 from impact_posture.system.arrays import Array
 
 # Smaller numbers in rotation matrices and inertias (SI units) are rounding errors of zero.
 _ROUNDING = 1e-14
 
 
-def dynamics_hash(model: pin.Model, armature: Array) -> str:
-    """Return the hash of joints, placements, inertias and ``armature``, shape (nv,)."""
+def dynamics_hash(model: pin.Model, armature: Array, couplings: Sequence[JointCoupling] = ()) -> str:
+    """Return the hash of joints, placements, inertias, couplings and ``armature``, shape (nv,)."""
     joints = []
     for i in range(1, model.njoints):
         arrays = model.jointPlacements[i].homogeneous, model.inertias[i].matrix(), _axis(model.joints[i])
         numbers = [number for array in arrays for number in rounded(array)]
         joints.append([str(model.names[i]), str(model.joints[i].shortname()), int(model.parents[i]), *numbers])
-    return hash_of([joints, rounded(armature)])
+    return hash_of([joints, rounded(armature), *map(str, couplings)])
 
 
-def kinematics_hash(model: pin.Model, postures: Mapping[str, Array], default: str) -> str:
-    """Return the hash of joints, frames, position limits, named postures and the name of the default posture."""
+def kinematics_hash(
+    model: pin.Model, postures: Mapping[str, Array], default: str, couplings: Sequence[JointCoupling] = ()
+) -> str:
+    """Return the hash of joints, frames, position limits, couplings, postures and the name of the default posture."""
     placed = [(f.name, int(f.parentJoint), rounded(f.placement.homogeneous)) for f in model.frames]
     for k in range(1, model.njoints):
         joint, numbers = model.joints[k], model.jointPlacements[k].homogeneous
         placed.append((joint.shortname(), int(model.parents[k]), rounded([*numbers.flat, *_axis(joint)])))
     arrays = model.lowerPositionLimit, model.upperPositionLimit, *postures.values()
-    return hash_of((placed, [rounded(values) for values in arrays], default))
+    return hash_of((placed, [rounded(values) for values in arrays], default, *map(str, couplings)))
 
 
 def hash_of(content: object) -> str:

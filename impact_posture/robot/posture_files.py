@@ -208,6 +208,11 @@ def set_joints(robot: Robot, q: Array, joints: Mapping[str, object], where: str)
                 fault = f"joint '{name}' takes {nq} numbers, not {len(numbers)}"
                 raise PostureError(fault, where=where, hint="correct it")
             q[entries] = numbers
+    exact = robot.coupled(q)
+    for c in robot.couplings:
+        if c.follower not in joints:
+            entries = q_slice(robot.model, robot.joint_id(c.follower))
+            q[entries] = exact[entries]
     return q
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from impact_posture.config.checked import checked
 from impact_posture.config.problem_settings import ContactPose, JointModel, RobotSettings, Root
@@ -20,8 +21,15 @@ from impact_posture.errors import (
     PostureError,
     PostureNotFound,
 )
+from impact_posture.robot.joint_coupling import (
+    JointCoupling,
+    coupled,
+    coupled_entries,
+    coupling_matrix,
+    with_partners,
+)
 from impact_posture.robot.model_hash import dynamics_hash, hash_of, kinematics_hash, rounded
-from impact_posture.robot.model_joints import JOINT_ENTRIES, joint_family, joint_range, q_slice
+from impact_posture.robot.model_joints import JOINT_ENTRIES, immovable_joints, joint_family, joint_range, q_slice
 from impact_posture.robot.robot_spec import RobotSpec
 from impact_posture.system.arrays import Array
 
@@ -33,6 +41,8 @@ FIXED_CONVENTION = "q = [joints]; v = [joint rates]; SI units, radians"
 
 # A joint that is beyond a position limit by less than this (rad, m) is treated as on the limit.
 _ON_LIMIT = 1e-6
+# A follower may differ from its coupling by this (rad, m) in a posture, for example because of rounded numbers.
+_COUPLED = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,10 +77,10 @@ class Robot:
         warnings: Warnings about this model, one line each.
         joint_model: Model of the inertia at the joints (:func:`~impact_posture.robot.joint_model.with_joint_model`).
         stated_armature: Original armature, shape (nv,), if ``joint_model`` has changed ``model.armature``.
+        couplings: Couplings of joints, by which a follower moves with its leader.
         settings: Settings of :func:`~impact_posture.robot.robot_loader.load_robot`; ``None`` if another function made
             the robot.
         mjcf: The compiled MJCF; ``None`` for a URDF.
-        mimics: Mimicking joint → mimicked joint; their coupling is left out.
     """
 
     name: str
@@ -85,9 +95,9 @@ class Robot:
     warnings: tuple[str, ...] = ()
     joint_model: JointModel = "reflected"
     stated_armature: Array | None = None
+    couplings: tuple[JointCoupling, ...] = ()
     settings: RobotSettings | None = None
     mjcf: CompiledMjcf | None = None
-    mimics: Mapping[str, str] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         return f"Robot({self.name!r}, root={self.root!r}, nq={self.nq}, nv={self.nv}, source={self.source!r})"
@@ -142,6 +152,30 @@ class Robot:
         """Armature before changes by the joint model, shape (nv,), kg·m² (kg for prismatic joints)."""
         return np.array(self.model.armature if self.stated_armature is None else self.stated_armature, dtype=float)
 
+    @cached_property
+    def coupling_matrix(self) -> Array:
+        """Projector ``C`` onto the velocities that the couplings of joints allow, ``ν = C ν``, shape (nv, nv)."""
+        return coupling_matrix(self.model, self.couplings)
+
+    @cached_property
+    def coupled_entries(self) -> list[tuple[int, int, float]]:
+        """Entry of the follower in ν, entry of the leader, and ratio, for each coupling of joints that can move."""
+        return coupled_entries(self.model, self.couplings)
+
+    @cached_property
+    def projector(self) -> Array:
+        """Projector onto the velocities that an impact can change: coupled, and zero at locked joints, (nv, nv)."""
+        return np.asarray(self.coupling_matrix * np.isfinite(self.model.armature))
+
+    @cached_property
+    def followers(self) -> NDArray[np.bool_]:
+        """Whether each velocity entry belongs to a joint that follows another joint, shape (nv,)."""
+        return np.asarray(np.diag(self.coupling_matrix) == 0)
+
+    def fixed_with(self, hold: Sequence[str]) -> tuple[str, ...]:
+        """Return the joints that cannot move if the joints ``hold`` do not: also those with equal position limits."""
+        return with_partners(self.couplings, (*hold, *immovable_joints(self.model)))
+
     @property
     def velocity_limits(self) -> Array:
         """Velocity limits, rad/s or m/s, shape (nv,); infinite for entries without a limit."""
@@ -162,17 +196,17 @@ class Robot:
     @cached_property
     def model_sha256(self) -> str:
         """Hash of the data of the dynamics: joints, placements, inertias and :attr:`armature`."""
-        return dynamics_hash(self.model, self.armature)
+        return dynamics_hash(self.model, self.armature, self.couplings)
 
     @cached_property
     def impact_sha256(self) -> str:
         """Hash like :attr:`model_sha256`, but with ``model.armature``, which depends on the joint model."""
-        return dynamics_hash(self.model, np.asarray(self.model.armature))
+        return dynamics_hash(self.model, np.asarray(self.model.armature), self.couplings)
 
     @cached_property
     def kinematics_sha256(self) -> str:
         """Hash of joints, frames, position limits, and postures."""
-        return kinematics_hash(self.model, self.postures, self.default_posture)
+        return kinematics_hash(self.model, self.postures, self.default_posture, self.couplings)
 
     @cached_property
     def data_sha256(self) -> str:
@@ -238,7 +272,7 @@ class Robot:
 
     @checked
     def check_posture(self, q: Array, *, where: str = "posture", limits: bool = True) -> Array:
-        """Check length, finiteness, quaternion and limits of ``q``; return ``q`` with unit quaternions.
+        """Check length, finiteness, quaternion, couplings and limits; return ``q`` with unit quaternions.
 
         Raises:
             PostureError: ``q`` has a wrong length, a number that is not finite, or an invalid quaternion.
@@ -256,8 +290,25 @@ class Robot:
             self._check_swapped(q[3:7], where)
         q = pin.normalize(self.model, q)
         if limits:
+            q = self._check_coupled(q, where)
             self.check_limits(q, where=where)
         return np.asarray(q)
+
+    def coupled(self, q: Array) -> Array:
+        """Return a copy of ``q``, shape (nq,), with each follower at the position that its leader requires."""
+        return coupled(self.model, self.couplings, q)
+
+    def _check_coupled(self, q: Array, where: str) -> Array:
+        """Return ``q`` with exact positions of followers; raise an error if a position is clearly wrong."""
+        exact = self.coupled(q)
+        for c in self.couplings:
+            index = self.model.idx_qs[self.model.getJointId(c.follower)]
+            if abs(exact[index] - q[index]) > _COUPLED:
+                fault = (
+                    f"joint '{c.follower}' is at {q[index]:.4g}, but it follows '{c.leader}' to {exact[index]:.4g}"
+                )
+                raise PostureError(fault, where=where, hint=f"change one of them, or leave out '{c.follower}'")
+        return exact
 
     def _check_norms(self, q: Array, where: str) -> None:
         """Raise an error if a quaternion, or a cosine and sine of a continuous joint, does not have unit length."""

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import pinocchio as pin
 
 from impact_posture.config.problem_settings import Root
+from impact_posture.robot.joint_coupling import JointCoupling, present
 from impact_posture.robot.mjcf_file import is_mjcf, read_mjcf
 from impact_posture.robot.mjcf_model import configuration, model_of
 from impact_posture.robot.urdf import build_model
@@ -23,7 +24,7 @@ class RobotDescription(NamedTuple):
         root: Joint between the world and the base.
         neutral: Configuration from which named postures start: zero for a URDF, ``qpos0`` for an MJCF, shape (nq,).
         postures: Name of a keyframe → configuration, shape (nq,).
-        mimics: Mimicking joint → mimicked joint.
+        couplings: Couplings of joints.
         warnings: Warnings, one line each.
         mjcf: The ``mujoco.MjModel``; ``None`` for a URDF.
     """
@@ -32,7 +33,7 @@ class RobotDescription(NamedTuple):
     root: Root
     neutral: Array
     postures: Mapping[str, Array]
-    mimics: Mapping[str, str]
+    couplings: tuple[JointCoupling, ...]
     warnings: tuple[str, ...]
     mjcf: Any = None
 
@@ -52,5 +53,5 @@ def read_description(path: Path, root: Root | None, *, accept_inertias: bool = F
         postures = {name: configuration(model, file.model, entries) for name, entries in file.keyframes.items()}
         neutral = configuration(model, file.model)
         return RobotDescription(model, file.root, neutral, postures, file.couplings, file.notes, file.model)
-    model, warnings, mimics = build_model(path, free_flyer=root == "free-flyer", accept_inertias=accept_inertias)
-    return RobotDescription(model, root or "fixed", pin.neutral(model), {}, mimics, warnings)
+    model, warnings, couplings = build_model(path, free_flyer=root == "free-flyer", accept_inertias=accept_inertias)
+    return RobotDescription(model, root or "fixed", pin.neutral(model), {}, present(couplings, model), warnings)

@@ -26,6 +26,7 @@ from impact_posture.errors import (
 )
 from impact_posture.robot.armature import armature_warning, set_armature
 from impact_posture.robot.inertia_checks import check_any_mass, check_mass_matrix, check_moved_mass, massless_joints
+from impact_posture.robot.joint_coupling import couple_limits, coupled, present, with_partners
 from impact_posture.robot.model_joints import immovable_joints, joint_index, movable_joints, q_slice, v_slice
 from impact_posture.robot.named_postures import ignored_bases, named_postures
 from impact_posture.robot.robot import CompiledMjcf, Robot
@@ -68,12 +69,15 @@ def build_robot(located: Located, options: LoadOptions) -> Robot:
     _check_package_dirs(options.package_dir, Path(), "package_dir")
     _check_package_dirs(spec.model.package_dirs, base, f"{name} robot.toml [model] package_dirs")
     described = read_description(urdf, options.root or spec.model.root, accept_inertias=spec.model.accept_inertias)
-    model, root, mimics, warnings = described.model, described.root, described.mimics, described.warnings
+    model, root, warnings = described.model, described.root, described.warnings
     _remount(model, options.mounting, name)
     srdf = srdf_path(spec, options, base)
     _override_limits(model, spec, name)
     _check_limits(model, source)
+    couplings = described.couplings
+    warnings = (*warnings, *couple_limits(model, couplings))
     postures, default = named_postures(described, srdf, spec, name)
+    postures = {key: coupled(model, couplings, q) for key, q in postures.items()}
     armature_source = set_armature(model, spec, srdf, options.armature, name)
     check_any_mass(model, source)
     locked = _named(model, (*spec.model.lock, *options.lock), f"{name} lock")
@@ -81,19 +85,18 @@ def build_robot(located: Located, options: LoadOptions) -> Robot:
         massless = (joint for joint in massless_joints(model) if joint != "root_joint")
         locked = tuple(dict.fromkeys((*locked, *massless)))
     mjcf = None if described.mjcf is None else CompiledMjcf(described.mjcf, model, postures[default])
+    locked = with_partners(couplings, locked)
     if locked:
         model, postures = _lock(model, locked, postures, default, name)
     check_moved_mass(model, source)
-    free = [joint for joint in mimics if model.existJointName(joint) and joint not in spec.constraints.hold]
-    coupled = "but moves by itself here, because the coupling is left out; lock it (`lock`) if that matters"
-    warnings = (*warnings, *(f"joint '{joint}' mimics '{mimics[joint]}' {coupled}" for joint in free))
     warnings = (*warnings, *_immovable(model))
     if root == "fixed":
         warnings = (*warnings, *ignored_bases(spec, srdf, default))
     warnings = (*warnings, *armature_warning(model, armature_source, spec.constraints.hold))
     loaded = Robot(
         name=name, source=source, model=model, root=root, postures=postures, default_posture=default, spec=spec,
-        locked=locked, armature_source=armature_source, warnings=warnings, mjcf=mjcf, mimics=mimics,
+        locked=locked, armature_source=armature_source, warnings=warnings, couplings=present(couplings, model),
+        mjcf=mjcf,
     )  # fmt: skip
     check_mass_matrix(loaded, source)
     return loaded

@@ -56,6 +56,7 @@ def summarize(robot: Robot) -> dict[str, Any]:
         "q_names": robot.q_names,
         "mass": robot.mass,
         "locked": robot.locked,
+        "couplings": robot.couplings,
         "armature_source": robot.armature_source,
         "joints": [_joint(robot, name) for name in robot.joint_names],
         "frames": _frames(robot),

@@ -16,8 +16,9 @@ from xml.parsers import expat
 
 import pinocchio as pin
 
-from impact_posture.errors import PackageNotFound, SpecError, UrdfError, nearest
+from impact_posture.errors import PackageNotFound, SpecError, UrdfError
 from impact_posture.robot.inertia_checks import check_inertias
+from impact_posture.robot.joint_coupling import JointCoupling, urdf_couplings
 from impact_posture.robot.urdf_joints import clear_negative_limits, correct_joints
 
 # pin.Data always contains 6 nv³ numbers: 0.4 GB at 200 degrees of freedom, and 48 GB at 1,000.
@@ -83,8 +84,8 @@ def example_models(suffix: str = ".urdf") -> list[str]:
 
 def build_model(
     path: Path, *, free_flyer: bool, accept_inertias: bool = False
-) -> tuple[pin.Model, tuple[str, ...], dict[str, str]]:
-    """Parse a URDF without its meshes; return the model, warnings, and the mimicked joint of each mimicking joint.
+) -> tuple[pin.Model, tuple[str, ...], tuple[JointCoupling, ...]]:
+    """Parse a URDF without its meshes; return the model, warnings, and the couplings of its joints.
 
     ``free_flyer`` adds a free-flyer joint before the root link.  With ``accept_inertias``, impossible inertias are
     warnings instead of errors.
@@ -96,10 +97,11 @@ def build_model(
     root = parse_urdf(path)
     _check_depth(root, path)
     below_zero = clear_negative_limits(root)
+    couplings, lost = urdf_couplings(root, str(path))
     try:
         with quiet_stderr() as errors:
             # The decoded text instead of the file, because urdfdom reads each file as UTF-8.
-            text = ET.tostring(root, encoding="unicode") if below_zero else _xml_text(path)
+            text = ET.tostring(root, encoding="unicode") if below_zero or couplings else _xml_text(path)
             model = pin.buildModelFromXML(text, *([pin.JointModelFreeFlyer()] if free_flyer else []))
     except Exception as error:  # The type of exception differs between versions of Pinocchio.
         fault = f"makes no robot ({errors[0] or error})"
@@ -114,9 +116,8 @@ def build_model(
     if model.nv > MOST_DEGREES_OF_FREEDOM:
         fault = f"has {model.nv} degrees of freedom, more than the supported {MOST_DEGREES_OF_FREEDOM}"
         raise UrdfError(fault, where=str(path), hint="in the URDF, fix the joints that hardly matter")
-    mimics, lost = _mimics(root)
     checked = (*check_inertias(root, model, path, accept_inertias), *correct_joints(root, model, path))
-    return model, (*checked, *lost, *below_zero), mimics
+    return model, (*checked, *lost, *below_zero), couplings
 
 
 def _check_depth(root: ET.Element, path: Path) -> None:
@@ -136,19 +137,6 @@ def _check_depth(root: ET.Element, path: Path) -> None:
     if below:
         link = next(link for link in parents if link in below)
         raise UrdfError(f"link '{link}' is below itself", where=str(path), hint="correct its joints")
-
-
-def _mimics(root: ET.Element) -> tuple[dict[str, str], list[str]]:
-    """Return the mimicked joint of each mimicking joint, and a warning for each ``<mimic>`` of an unknown joint."""
-    joints = {joint.get("name", ""): joint.find("mimic") for joint in root.findall("joint")}
-    mimics = {name: mimic.get("joint", "") for name, mimic in joints.items() if mimic is not None}
-    lost = [
-        f"joint '{name}' mimics '{other}', which is not a joint of the URDF (did you mean "
-        f"{nearest(other, joints, 1)[0]}?): it moves by itself; correct its <mimic>"
-        for name, other in mimics.items()
-        if other not in joints
-    ]
-    return {name: other for name, other in mimics.items() if other in joints}, lost
 
 
 def parse_urdf(path: Path) -> ET.Element:

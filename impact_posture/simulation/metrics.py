@@ -112,7 +112,7 @@ def measure(setup: Setup, run: Run) -> Metrics:
     # Leave out missed contacts, because they would appear as small impacts.
     loads = [impact_load(setup, series, w) for w in impacts if w.touched]
     load = mean_load(loads or [ImpactLoad(None, None, None, 0.0, 0.0, 0.0)])
-    later = [_largest(_change(setup, series, w, w.end)) for w in run.of("recovery") if w.touched] or [0.0]
+    later = [_largest(setup, _change(setup, series, w, w.end)) for w in run.of("recovery") if w.touched] or [0.0]
     stopped = (series.at_stop[inside] & ~series.at_stop[0]).any(axis=0)
     return Metrics(
         q_total_impact=distance(series.v[inside]),
@@ -173,7 +173,10 @@ def impact_load(setup: Setup, series: Series, window: Window) -> ImpactLoad:
     # The second push or throw has the opposite direction.
     along = abs(float(setup.scenario.normal @ impulse))
     return ImpactLoad(
-        **vars(effect), impulse=along, peak_force=float(series.peak[inside].max(initial=0.0)), jump=_largest(change)
+        **vars(effect),
+        impulse=along,
+        peak_force=float(series.peak[inside].max(initial=0.0)),
+        jump=_largest(setup, change),
     )
 
 
@@ -183,5 +186,6 @@ def _change(setup: Setup, series: Series, window: Window, end: float) -> Array:
     return after if setup.scenario.push else after - series.v[before(series, window)]
 
 
-def _largest(change: Array) -> float:
-    return float(np.linalg.norm(change, axis=1).max(initial=0.0))
+def _largest(setup: Setup, change: Array) -> float:
+    """Return the largest norm; as in the metrics of an impact, followers do not count."""
+    return float(np.linalg.norm(change[:, ~setup.robot.followers], axis=1).max(initial=0.0))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from impact_posture.errors import InputError
 from impact_posture.robot.actuation import actuation_matrix, thrust_limits
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
@@ -28,9 +29,18 @@ class Actuators:
         lower: Lower limits of rotor thrusts (N), then of joint torques (N·m), shape (controls,).
         upper: Upper limits in the same order; infinite for joints whose effort limit is missing or zero.
         names: Names of the controls.
+
+    Raises:
+        InputError: A joint follows another joint (:class:`JointCoupling`), and robot.toml does not hold them.
     """
 
     def __init__(self, robot: Robot) -> None:
+        held = robot.fixed_with([joint for joint in robot.spec.constraints.hold if joint not in robot.locked])
+        for c in robot.couplings:
+            if c.follower not in held:
+                fault = f"the controller drives each joint by itself, but '{c.follower}' follows '{c.leader}'"
+                hint = "`lock` both, or list them in robot.toml [constraints] hold"
+                raise InputError(fault, where=robot.name, hint=hint)
         propulsion = robot.spec.propulsion
         self._propulsion = propulsion
         self.base = robot.first_joint

@@ -14,9 +14,8 @@ from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.codegen.self_test import RESULTS, casadi_reference, oracle_along
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.mujoco_numeric import MujocoNumeric
-from impact_posture.dynamics.numeric import hold_locked
+from impact_posture.dynamics.numeric import reduced
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
-from impact_posture.robot.model_joints import finite_armature
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 from impact_posture.system.libraries import build_library, load_library
@@ -160,7 +159,6 @@ class MujocoSource:
 
     def __init__(self, objective: WorstCaseObjective) -> None:
         self._objective = objective
-        _, self._locked = finite_armature(objective.robot.model)
         frames = [contact.frame for contact in objective.contacts] + [foot.frame for foot in objective.supports]
         self._numeric = MujocoNumeric(objective.robot, frames)
 
@@ -179,8 +177,9 @@ class MujocoSource:
         contact, metric = objective.contact, objective.metric
         M, J = numeric.mass_matrix(), numeric.jacobian(contact.frame, contact.offset)[:3]
         feet = [numeric.jacobian(s.frame, s.offset)[: s.rows] for s in objective.supports]
-        M, J, Js = hold_locked(self._locked, M, J, np.vstack([np.zeros((0, len(M))), *feet]))
+        M, J, Js = reduced(objective.robot.projector, M, J, np.vstack([np.zeros((0, len(M))), *feet]))
         system = np.block([[M, -Js.T], [Js, objective.compliance * np.eye(len(Js))]])
+        # Entries of followers and locked joints are zero here.
         A = np.linalg.solve(system, np.vstack([J.T, np.zeros((len(Js), 3))]))[: len(M)]
         weighed = M @ A if metric.kind == "kinetic" else metric.diagonal(len(M))[:, None] * A
         n = normal if contact.normal_frame == "world" else numeric.rotation(contact.frame) @ normal

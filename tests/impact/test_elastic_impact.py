@@ -126,8 +126,10 @@ def stepped(case: ImpactCase, q: Vector, stiffness: float, speed: float) -> Step
         n = frame_placement(bare, q, frame).rotation @ n
     j = n @ frame_jacobian(bare, q, frame, case.contact.offset)[:3]
     inverse = np.zeros((nv, nv))
-    inverse[np.ix_(moves, moves)] = np.linalg.inv(M[np.ix_(moves, moves)])
-    W = links if case.metric.kind == "kinetic" else np.diag(case.metric.diagonal(nv))
+    C, followers = result.coupling_matrix, result.followers
+    inverse[np.ix_(moves, moves)] = np.linalg.inv((C.T @ M @ C + np.diag(1.0 * followers))[np.ix_(moves, moves)])
+    inverse = C @ inverse @ C.T
+    W = links if case.metric.kind == "kinetic" else np.diag(case.metric.diagonal(nv) * ~followers)
 
     def torque(state: Vector) -> Vector:
         x, y, dx, dy = state[: 4 * nv].reshape(4, nv)

@@ -30,7 +30,7 @@ from tests.support.helpers import (
     central_gradient,
     random_configurations,
     relative,
-    robot,
+    uncoupled,
 )
 from tests.support.settings import make_settings
 
@@ -38,7 +38,7 @@ FRAMES = {"tilthex_arm": "ee", "panda": "panda_hand_tcp", "ur5": "tool0"}
 
 
 def struck(name: str, friction: float, normal: tuple[float, float, float] = (0.3, 0.1, 1.0)) -> WorstCaseObjective:
-    return WorstCaseObjective(robot(name), ImpactContact(FRAMES[name], normal, friction=friction))
+    return WorstCaseObjective(uncoupled(name), ImpactContact(FRAMES[name], normal, friction=friction))
 
 
 def simulated(objective: WorstCaseObjective, q: Vector, surface: Surface) -> SimulatedImpact:

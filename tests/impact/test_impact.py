@@ -132,8 +132,10 @@ def test_oracle_by_its_definition(name: str) -> None:
         n = np.array(contact.normal)
         if contact.normal_frame == "contact":
             n = frame_placement(model, q, frame).rotation @ n
-        W = M if metric.kind == "kinetic" else np.eye(loaded.nv)
-        A = np.linalg.solve(held, J.T)
+        # The fingers of panda are coupled: ν = C ν, and the follower does not count in the metric.
+        C, followers = loaded.coupling_matrix, np.diag(1.0 * loaded.followers)
+        W = M if metric.kind == "kinetic" else np.eye(loaded.nv) - followers
+        A = C @ np.linalg.solve(C.T @ held @ C + followers, C.T @ J.T)
         ellipsoid, mobility = A.T @ W @ A, J @ A
         s = np.linalg.solve(mobility, n)
         G = n @ mobility @ n

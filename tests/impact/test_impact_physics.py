@@ -32,6 +32,7 @@ from tests.support.helpers import (
     relative,
     rng,
     robot,
+    uncoupled,
     unit,
 )
 
@@ -75,7 +76,7 @@ def jacobians(loaded: Robot, q: Vector, supports: tuple[Support, ...]) -> tuple[
 @pytest.mark.parametrize("name", NAMES)
 def test_an_impact_stops_the_contact_and_dissipates_e(name: str) -> None:
     """The impulse ``λ = v_n/G`` stops the approach and dissipates ``E v_n²``; a sticking impact stops the point."""
-    loaded = robot(name)
+    loaded = uncoupled(name)
     generator = rng(name, "energy")
     for q in random_configurations(loaded.model, 2, name, "energy"):
         n, speed = unit(generator), 1.7
@@ -136,7 +137,7 @@ def test_feet_never_add_mobility(name: str) -> None:
 @pytest.mark.parametrize("name", ["solo8", "panda", "tilthex_arm", "talos"])
 def test_root_h_is_the_ellipsoids_half_width(name: str, metric: str) -> None:
     """The image of the unit ball under ``JM⁻¹W^½`` is an ellipsoid, whose largest extent along n is ``√H``."""
-    loaded, generator = robot(name), rng(name, metric, "width")
+    loaded, generator = uncoupled(name), rng(name, metric, "width")
     weights = generator.uniform(0.5, 2.0, loaded.nv)
     chosen = Metric("weighted", tuple(weights)) if metric == "weighted" else Metric(metric)  # type: ignore[arg-type]
     (q,) = random_configurations(loaded.model, 1, name, metric, "width")

@@ -40,6 +40,7 @@ from tests.support.helpers import (
     relative,
     rng,
     robot,
+    uncoupled,
     unit,
 )
 from tests.support.settings import make_settings
@@ -76,8 +77,8 @@ def along(form: np.ndarray, normals: np.ndarray) -> np.ndarray:
 
 def pinocchio_form(name: str, frame: str, q: np.ndarray, kind: ObjectiveKind) -> np.ndarray:
     """Return the matrix of the objective's quadratic form by dense algebra: Λ_c, B⁻¹Λ_cB⁻¹ or B = JM⁻¹Jᵀ."""
-    model = robot(name).model
-    J = frame_jacobian(model, q, robot(name).frame_id(frame))[:3]
+    model = uncoupled(name).model
+    J = frame_jacobian(model, q, uncoupled(name).frame_id(frame))[:3]
     A = np.linalg.solve(mass_matrix(model, q), J.T)
     if kind == "energy":
         return np.asarray(J @ A)
@@ -91,7 +92,7 @@ def pinocchio_form(name: str, frame: str, q: np.ndarray, kind: ObjectiveKind) ->
 @pytest.mark.parametrize("degrees", ANGLES)
 @pytest.mark.parametrize("name", ROBOTS)
 def test_the_value_bounds_a_hundred_thousand_normals_closely(name: str, degrees: float) -> None:
-    for index, q in enumerate(random_configurations(robot(name).model, 3, name, degrees, spread=0.5)):
+    for index, q in enumerate(random_configurations(uncoupled(name).model, 3, name, degrees, spread=0.5)):
         axis = unit(rng(name, degrees, index))
         normals = cone_samples(axis, degrees)
         for kind in CONE_KINDS:
@@ -100,7 +101,7 @@ def test_the_value_bounds_a_hundred_thousand_normals_closely(name: str, degrees:
             worst = 1 / (2 * sampled.min()) if kind == "energy" else 9 * sampled.max()
             worst /= 9 if kind == "sticking" else 1
             contact = ImpactContact(ROBOTS[name], tuple(axis), impulse=3.0)
-            value = WorstCaseObjective(robot(name), contact, kind=kind, normal_cone_deg=degrees).value(q)
+            value = WorstCaseObjective(uncoupled(name), contact, kind=kind, normal_cone_deg=degrees).value(q)
             assert value >= worst * (1 - 1e-11), (name, kind, degrees)
             assert value <= worst * (1 + 1e-4), (name, kind, degrees)
 

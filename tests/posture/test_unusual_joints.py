@@ -5,16 +5,22 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pinocchio as pin
 import pytest
 
 from impact_posture.collision.robot_shapes import RobotShapes, load_shapes
 from impact_posture.config.problem_settings import ProblemSettings
 from impact_posture.config.table_validation import validate
 from impact_posture.dynamics.numeric import Numeric
+from impact_posture.posture.approach.attainable_speed import AttainableSpeed
+from impact_posture.posture.constraints.requirements import Requirements
 from impact_posture.posture.formulation.problem_file import prepare
+from impact_posture.posture.manifold.feasible_start import feasible_start
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem
 from impact_posture.posture.search.growing_search import feasible
 from impact_posture.posture.search.multistart import solve
+from tests.support.helpers import central_gradient
 from tests.support.urdfs import MOVED, joint, link, load, write
 
 LINKS = (link("stand", 5), link("upper", 2, "0.2 0 0"), link("fore", 1.5, "0.2 0 0"), link("palm", 0.5, "0.05 0 0"))
@@ -120,3 +126,58 @@ def test_parts_of_a_telescope_may_overlap(tmp_path: Path) -> None:
     assert {*telescope("1 0 0").always_touching} == nested
     assert not len(telescope("1 0 0").pairs)
     assert ("boom0", "boom3") not in telescope("0 1 0").always_touching
+
+
+def coupled_gripper(folder: Path, frame: str = "right", **settings: Any) -> ConstrainedProblem:
+    """Return a problem in which the right finger moves 1.5 times as far as the left finger, upwards."""
+    slide = MOVED.replace("-2.5", "0").replace("2.5", "0.04")
+    mimic = '<mimic joint="left_joint" multiplier="1.5" offset="0.005"/>'
+    fingers = (
+        link("left", 0.3, "0.04 0 0"), link("right", 0.4, "0.04 0 0"),
+        joint("left_joint", "palm left", "0 1 0.5", "0.08 0 0", "prismatic", slide),
+        joint("right_joint", "palm right", "0 -1 0.5", "0.08 0 0", "prismatic", MOVED + mimic),
+    )  # fmt: skip
+    arm = joint("a", "stand upper", at="0 0 0.3"), joint("b", "upper fore", at="0.4 0 0")
+    return posed(folder, *LINKS, *TIP, *arm, joint("c", "fore palm", at="0.4 0 0"), *fingers, frame=frame, **settings)
+
+
+def test_the_motor_of_the_leader_carries_its_followers(tmp_path: Path) -> None:
+    """The torques at rest are those of Pinocchio's model with mimic joints."""
+    problem = coupled_gripper(tmp_path)
+    reference = pin.buildModelFromUrdf(str(tmp_path / "written.urdf"), mimic=True)
+    q = problem.robot.coupled(np.array([-0.4, 1.1, 0.3, 0.02, 0.0]))
+    (holdable,) = [c for c in problem.constraints if c.describe() == "joint torques within limits at rest"]
+    expected = np.array(pin.computeGeneralizedGravity(reference, reference.createData(), q[:4])) / 100
+    rows = holdable.evaluate(Numeric(problem.robot.model).at(q))[0][1:]
+    assert rows + 1 == pytest.approx(np.abs(expected), abs=1e-12)
+    assert abs(expected[3]) > 0.01
+    assert not [note for note in problem.notes if "not checked" in note]
+
+
+def test_a_follower_moves_with_its_leader_in_program_and_approach(tmp_path: Path) -> None:
+    problem = coupled_gripper(tmp_path, contact_pose="box")
+    assert "joint 'right_joint' moves with 'left_joint'" in problem.describe()
+    solution = solve(problem, starts=4, jobs=1, compile="never")
+    assert solution.certificate.holds()
+    assert solution.q[4] == pytest.approx(1.5 * solution.q[3] + 0.005, abs=1e-9)
+    random = [feasible_start(problem, k, 1) for k in range(1, 12)]
+    values = [problem.objective.value(q) for q in random if q is not None]
+    assert values and solution.optima[0].objective < min(values)
+    # The limit 5 m/s of the right finger bounds the left finger, whose own limit would allow 7.5 m/s.
+    assert problem.robot.velocity_limits[3:] == pytest.approx([5 / 1.5, 5])
+    attainable = AttainableSpeed(problem.robot, problem.objective, Requirements(contact_pose="position"))
+    assert [problem.robot.tangent_names[k] for k in attainable.free] == ["a", "b", "c", "left_joint"]
+    numeric = Numeric(problem.robot.model).at(problem.given)
+    attained = attainable.at(numeric)
+    v = attainable.moves @ attained.velocities
+    assert v[4] == pytest.approx(1.5 * v[3]) and np.abs(v[3:]).max() <= 5 + 1e-9
+    slope = central_gradient(
+        lambda q: attainable.at(Numeric(problem.robot.model).at(q)).speed, problem.robot.model, problem.given, 1e-4
+    )
+    assert attained.gradient == pytest.approx(slope, abs=1e-5 * np.abs(slope).max())
+
+
+def test_holding_one_coupled_joint_holds_the_others(tmp_path: Path) -> None:
+    problem = coupled_gripper(tmp_path, hold=("right_joint",))
+    assert set(problem.requirements.hold) == {"left_joint", "right_joint"}
+    assert not [c for c in problem.constraints if c.name.startswith("coupling")]

@@ -164,16 +164,6 @@ def test_a_mimic_of_a_joint_that_does_not_exist_is_a_warning(load: Load) -> None
         assert f"'b_c' mimics '{other}', which is not a joint of the URDF (did you mean a_b?)" in warnings[0]
 
 
-def test_a_mimic_joint_that_moves_by_itself_is_a_warning(load: Load) -> None:
-    parts = link("a", GOOD), link("b", OFF_AXIS), link("c", OFF_AXIS), joint("a", "b")
-    coupled = joint("b", "c").replace("</joint>", '<mimic joint="a_b" multiplier="2"/></joint>')
-    for toml, warned in (("", True), ('[model]\nlock = ["b_c"]', False), ('[constraints]\nhold = ["b_c"]', False)):
-        loaded = load(*parts, coupled, toml=toml)
-        warnings = [line for line in loaded.warnings if "mimics" in line]  # type: ignore[attr-defined]
-        assert len(warnings) == warned
-        assert not warned or "'b_c' mimics 'a_b' but moves by itself here" in warnings[0]
-
-
 def test_swapped_limits(load: Load) -> None:
     swapped = joint("a", "b").replace('lower="-1" upper="1"', 'lower="1" upper="-1"')
     elements = (link("a", GOOD), link("b", OFF_AXIS), swapped)

@@ -23,6 +23,7 @@ from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.posture.formulation.problem_file import prepare, read_settings
 from impact_posture.posture.program.compiled_solver import _key
 from impact_posture.posture.search.multistart import solve
+from impact_posture.robot.joint_coupling import present, with_partners
 from impact_posture.robot.joint_model import describe_joints, transmissions, with_joint_model
 from impact_posture.robot.model_joints import q_slice
 from impact_posture.robot.model_variant import Payload, between, build_model_variants
@@ -101,7 +102,9 @@ def test_locked_joints_equal_a_model_without_them(name: str, kind: ObjectiveKind
     """Pinocchio builds the reduced model separately for each posture."""
     loaded = robot(name)
     supports = () if name == "talos" else loaded.spec.supports
-    joints = {joint: JointTransmissionSpec("locked") for joint in loaded.joint_names[1::3]}
+    # Locking one finger of panda locks both.
+    locked = with_partners(loaded.couplings, loaded.joint_names[1::3])
+    joints = {joint: JointTransmissionSpec("locked") for joint in locked}
     some = with_joint_model(stated(loaded, joints=joints, kind="rigid"), "link")
     mine = replace(objective(some, FRAMES[name], kind, metric), supports=supports)
     ids = [loaded.joint_id(joint) for joint in joints]
@@ -110,7 +113,8 @@ def test_locked_joints_equal_a_model_without_them(name: str, kind: ObjectiveKind
         model = pin.buildReducedModel(loaded.model, ids, q)
         model.armature = loaded.armature[kept]
         names = tuple(n for n in loaded.joint_names if n not in joints)
-        alone = replace(loaded, model=model, spec=replace(loaded.spec, transmission=TransmissionSpec()))
+        spec = replace(loaded.spec, transmission=TransmissionSpec())
+        alone = replace(loaded, model=model, spec=spec, couplings=present(loaded.couplings, model))
         assert alone.joint_names == names
         other = replace(mine, robot=alone)
         short = np.concatenate([q[q_slice(loaded.model, i)] for i in range(1, loaded.model.njoints) if i not in ids])
@@ -233,7 +237,8 @@ def test_transmissions_by_joint() -> None:
             joints={first: JointTransmissionSpec("rigid"), second: JointTransmissionSpec(None, 9000.0, 0.0)},
         )
     )  # fmt: skip
-    assert list(table.elastic) == [False] + [True] * (loaded.nv - 1)
+    # The motor of the fingers drives the leader.
+    assert list(table.elastic) == [False] + [True] * (loaded.nv - 2) + [False]
     assert list(table.stiffness[:3]) == [14000.0, 9000.0, 14000.0] and list(table.damping[:3]) == [3.0, 0.0, 3.0]
 
 

@@ -37,7 +37,7 @@ def inside_limits(loaded: Robot) -> np.ndarray:
     for k in range(start, loaded.nq):
         if low[k] < high[k] and high[k] - low[k] < 100 and not low[k] <= q[k] <= high[k]:
             q[k] = rng(loaded.name, k).uniform(low[k], high[k])
-    return loaded.check_posture(q)
+    return loaded.check_posture(loaded.coupled(q))
 
 
 @pytest.mark.parametrize("name", NAMES)

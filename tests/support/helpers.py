@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import zlib
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
@@ -22,6 +23,12 @@ NAMES = known_robots()
 def robot(name: str) -> Robot:
     """Load a known robot once per process."""
     return load_robot(name)
+
+
+@functools.cache
+def uncoupled(name: str) -> Robot:
+    """Load a known robot without the couplings of its joints, for references that have no couplings."""
+    return replace(robot(name), couplings=())
 
 
 def rng(*key: object) -> np.random.Generator:

@@ -39,16 +39,18 @@ def test_the_jump_is_the_least_change_of_energy(name: str) -> None:
     model, q, v = robot(name).model, state.q, state.v
     M, J = mass_matrix(model, q), frame_jacobian(model, q, robot(name).frame_id(ROBOTS[name]))[:3]
     feet = [frame_jacobian(model, q, robot(name).frame_id(c.point.frame), c.point.offset)[: c.size] for c in contacts]
-    rows = np.vstack([J, *feet])
+    # The couplings of joints allow the velocities v = C v.
+    C = robot(name).coupling_matrix
+    rows = np.vstack([J, *feet, (np.eye(model.nv) - C)[robot(name).followers]])
     wanted = np.zeros(rows.shape[0])
     wanted[:3] = -(1 + e) * normal * (normal @ J @ v)
-    # Gauss: of all jumps that the contacts allow, the impact causes the jump with the least kinetic energy.
+    # Gauss: of all jumps that contacts and couplings allow, the impact causes the jump with the least kinetic energy.
     root = np.linalg.cholesky(M).T
     expected = np.linalg.solve(root, np.linalg.lstsq(rows @ np.linalg.inv(root), wanted, rcond=1e-7)[0])
     jump, impulse = limits.jump(state)
     np.testing.assert_allclose(jump @ v, expected, atol=1e-5 * np.abs(expected).max())
     # The impulses of the contact and of the feet cause exactly the computed jump.
-    rest = M @ (jump @ v) - impulse @ v
+    rest = C.T @ (M @ (jump @ v) - impulse @ v)
     if contacts:
         rest -= np.vstack(feet).T @ np.linalg.lstsq(np.vstack(feet).T, rest, rcond=1e-9)[0]
     assert np.abs(rest).max() < 1e-5 * np.abs(impulse @ v).max()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from impact_posture.config.json_block import JsonBlock
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
@@ -39,7 +40,7 @@ class JointYield(JsonBlock):
 def joint_yield(objective: WorstCaseObjective, q: Array) -> JointYield | None:
     """Return how the joints move the leading contact at ``q``, shape (nq,); ``None`` if no joint moves it."""
     robot, oracle = objective.robot, objective.oracle.at(q)
-    moving = ~oracle.numeric.locked
+    moving: NDArray[np.bool_] = np.asarray(robot.projector.any(axis=0))
     if robot.floating and not objective.supports:
         moving[:6] = False
     J, feet = oracle.J[:, moving], oracle.Js[:, moving]

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.dynamics.numeric import hold_locked
+from impact_posture.dynamics.numeric import reduced
 from impact_posture.impact.friction.contact_impulses import contact_impulses
 from impact_posture.impact.quantities.impact_oracle import ImpactOracle
 from impact_posture.robot.robot_spec import Support
@@ -80,12 +80,12 @@ class StandingFeet:
             self.frames += [support.frame] * len(corners)
         self.normals = np.tile([0.0, 0.0, 1.0], (len(self.frames), 1))
         M = oracle.numeric.mass_matrix()
-        self.M, self.jacobian = hold_locked(oracle.numeric.locked, M, np.vstack(rows))
+        self.M, self.jacobian = reduced(oracle.robot.projector, M, np.vstack(rows))
         self.forces = self._carried()
 
     def respond(self, J: Array) -> Array:
         """Return ``M⁻¹Jᵀ``, shape (nv, rows of ``J``)."""
-        return np.asarray(np.linalg.solve(self.M, J.T))
+        return np.asarray(self._oracle.robot.projector @ np.linalg.solve(self.M, J.T))
 
     def _carried(self) -> Array | None:
         """Return the forces under the weight if the robot is a rigid body: they stop its fall of one second."""

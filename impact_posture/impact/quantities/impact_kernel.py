@@ -38,7 +38,7 @@ class ImpactKernel:
     def __init__(self, case: ImpactCase, q: ca.SX, n: ca.SX, limbs: RepeatedLimbs | None = None) -> None:
         self.case, self.metric, self.q, self.n = case, case.metric, q, n
         extra = support_inertia(case.robot, case.supports, case.compliance)
-        self.tree = Tree(case.robot.model, q, extra_inertia=extra, limbs=limbs)
+        self.tree = Tree(case.robot.model, q, extra_inertia=extra, limbs=limbs, couplings=case.robot.coupled_entries)
         self.point = case.point
         self._supported = bool(case.supports)
 
@@ -198,9 +198,10 @@ class ImpactKernel:
     def _weigh(self, a: ca.SX, velocities: ByJoint) -> ca.SX:
         if self.metric.kind == "kinetic":
             return self.tree.mass_times(a, velocities, extra=False)
-        if self.metric.weights is None:
+        followers = self.case.robot.followers
+        if self.metric.weights is None and not followers.any():
             return a
-        return self.tree.by_joint("weight", self.metric.diagonal(self.tree.nv)) * a
+        return self.tree.by_joint("weight", self.metric.diagonal(self.tree.nv) * ~followers) * a
 
     def _force(self, impulse: ca.SX) -> Wrench:
         return Wrench(self.point, impulse, ca.SX.zeros(3))
@@ -216,7 +217,8 @@ def frozen_directions(robot: Robot, point: PointOnLink) -> Array:
     samples = [
         pin.integrate(robot.model, pin.neutral(robot.model), generator.normal(size=robot.nv)) for _ in range(3)
     ]
-    missing = null_space(np.vstack([numeric.at(q).jacobian(point)[:3].T for q in samples]), _FROZEN)
+    J = np.hstack([numeric.at(q).jacobian(point)[:3] @ robot.coupling_matrix for q in samples])
+    missing = null_space(J.T, _FROZEN)
     return np.asarray(missing @ missing.T)
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from impact_posture.dynamics.jump_derivatives import Foot
-from impact_posture.dynamics.numeric import Numeric, hold_locked
+from impact_posture.dynamics.numeric import Numeric, reduced
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.impact_contact import point_on
 from impact_posture.impact.quantities.impact_quantities import ImpactQuantities
@@ -69,7 +69,7 @@ class ImpactOracle:
         num = self.numeric
         parts = [num.jacobian(foot.point)[: foot.rows] for foot in self.feet]
         Js = np.vstack(parts) if parts else np.zeros((0, self._nv))
-        M, J, Js = hold_locked(num.locked, num.mass_matrix(), num.jacobian(self.point)[:3], Js)
+        M, J, Js = reduced(self.robot.projector, num.mass_matrix(), num.jacobian(self.point)[:3], Js)
         kkt = np.zeros((self._nv + len(Js),) * 2)
         kkt[: self._nv, : self._nv], kkt[: self._nv, self._nv :], kkt[self._nv :, : self._nv] = M, -Js.T, Js
         np.fill_diagonal(kkt[self._nv :, self._nv :], self.compliance)
@@ -81,21 +81,20 @@ class ImpactOracle:
         ``tau`` is a vector, or a matrix with one right-hand side per column.  ``slip`` is zero by default.
         """
         rhs: Array = np.zeros((len(self._kkt), *tau.shape[1:]))
-        rhs[: self._nv] = (tau.T * ~self.numeric.locked).T
+        rhs[: self._nv] = self.robot.projector.T @ tau
         if slip is not None:
             rhs[self._nv :] = slip
         solution = np.asarray(np.linalg.solve(self._kkt, rhs), dtype=np.float64)
-        return ImpulseResponse(solution[: self._nv], solution[self._nv :])
+        return ImpulseResponse(self.robot.projector @ solution[: self._nv], solution[self._nv :])
 
     def solve(self, tau: Array) -> Array:
         """Return ``(M + J_sᵀJ_s/ε)⁻¹ τ`` for a vector ``tau`` or for each column of a matrix."""
         return self.respond(tau).a
 
     def weigh(self, a: Array) -> Array:
-        """Return ``W a``."""
-        if self.metric.kind == "kinetic":
-            return np.asarray(self.M @ a)
-        return np.asarray((self.metric.diagonal(self._nv) * a.T).T)
+        """Return ``W a``; the entries of followers are zero, because their leaders determine them."""
+        weighed = self.M @ a if self.metric.kind == "kinetic" else (self.metric.diagonal(self._nv) * a.T).T
+        return np.asarray((weighed.T * ~self.robot.followers).T)
 
     def quantities(self, q: Array) -> ImpactQuantities:
         """Return all impact quantities at ``q``; results for recent postures are stored and reused."""
@@ -109,7 +108,7 @@ class ImpactOracle:
         ellipsoid = A.T @ self.weigh(A)
         a = A @ self.n
         H, G = float(a @ self.weigh(a)), float(self.n @ mobility @ self.n)
-        held = StickingPoint.of(self._kkt, self.J, mobility, ~self.numeric.locked)
+        held = StickingPoint.of(self._kkt, self.J, mobility, self.robot.projector)
         stuck, s = None, None
         if held.can_move(self.n):
             response, s = held.respond(velocity=self.n)
@@ -170,7 +169,7 @@ class ImpactOracle:
         """
         self.at(q)
         _, n = self._normals(normal)
-        held = StickingPoint.of(self._kkt, self.J, self.J @ self.solve(self.J.T), ~self.numeric.locked)
+        held = StickingPoint.of(self._kkt, self.J, self.J @ self.solve(self.J.T), self.robot.projector)
         if not held.can_move(n):
             raise no_sticking()
         x, s = held.respond(velocity=n)

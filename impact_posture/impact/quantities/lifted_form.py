@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from impact_posture.dynamics.jump_derivatives import Foot, JumpDerivatives
-from impact_posture.dynamics.tree import Tree, Wrench
+from impact_posture.dynamics.tree import Coupled, Tree, Wrench
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.impact_contact import point_on
 from impact_posture.impact.metric import Metric
@@ -121,6 +121,8 @@ class UnknownJump:
         compliance: Compliance ε of the supports, 1/kg.
         tree: The kinematic tree.  Each locked joint k has the equation ``a_k = 0``.
         contact_velocity: Velocity jump ``J a`` of the contact point, world axes, shape (3,).
+        couplings: Coupled joints.  A follower f has the equation ``a_f = ratio · a_l``, and its momentum is added to
+            the equation of its leader l.
     """
 
     a: ca.SX
@@ -132,6 +134,7 @@ class UnknownJump:
     compliance: float
     tree: Tree
     contact_velocity: ca.SX
+    couplings: Sequence[Coupled] = ()
 
     @property
     def jumps(self) -> tuple[PlacedJump, ...]:
@@ -149,7 +152,12 @@ class UnknownJump:
         moving = ca.SX.ones(count)
         moving[locked] = 0
         b, of_feet = moving * multipliers[:count], multipliers[count : count + self.f.numel()]
+        for follower, leader, ratio in self.couplings:
+            b[follower] = ratio * b[leader]
         jacobian, hessian = self.derivatives.of(self.a, self.f, b, of_feet, self.compliance)
+        for follower, leader, ratio in self.couplings:
+            jacobian[leader, :] += ratio * jacobian[follower, :]
+            locked.append(follower)
         jacobian[locked, :] = 0
         return ca.sparsify(jacobian), hessian
 
@@ -176,6 +184,10 @@ def unknown_jump(case: ImpactCase, tree: Tree, impact: Wrench, label: str = "") 
         f = ca.vertcat(f, f_k)
     pushed = -tree.generalized_force([impact])
     momentum = tree.mass_times(a, velocities, less=wrenches) + pushed
+    for follower, leader, ratio in case.robot.coupled_entries:
+        for rows in (momentum, pushed):
+            rows[leader] += ratio * rows[follower]
+            rows[follower] = a[follower] - ratio * a[leader]
     for k in tree.locked:
         momentum[k] = pushed[k] = a[k]
     return UnknownJump(
@@ -188,6 +200,7 @@ def unknown_jump(case: ImpactCase, tree: Tree, impact: Wrench, label: str = "") 
         compliance=case.compliance,
         tree=tree,
         contact_velocity=tree.point_velocity(impact.point, velocities)[:3],
+        couplings=case.robot.coupled_entries,
     )
 
 
@@ -206,7 +219,9 @@ def weighed(metric: Metric, first: UnknownJump, second: UnknownJump) -> ca.SX:
     if metric.kind == "kinetic":
         # The equations imply a₁ᵀMa₂ = sᵀJa₂ − εf₁ᵀf₂, but with stiff feet this difference loses digits.
         return ca.dot(first.a, second.tree.mass_times(second.a))
-    return ca.dot(first.a, ca.SX(metric.diagonal(first.a.numel())) * second.a)
+    weights = metric.diagonal(first.a.numel())
+    weights[[follower for follower, _, _ in first.couplings]] = 0.0
+    return ca.dot(first.a, ca.SX(weights) * second.a)
 
 
 def worst_of(parts: Sequence[Lifted | UnknownJump], values: Sequence[ca.SX], scale: ca.SX) -> Lifted:

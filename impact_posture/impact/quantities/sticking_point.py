@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from impact_posture.errors import MetricError
 from impact_posture.system.arrays import Array
@@ -38,13 +37,13 @@ class StickingPoint:
     system: Array
     axes: Array
     outside: Array
-    mobile: NDArray[np.bool_]
+    projector: Array
 
     @staticmethod
-    def of(kkt: Array, J: Array, mobility: Array, mobile: NDArray[np.bool_]) -> StickingPoint:
+    def of(kkt: Array, J: Array, mobility: Array, projector: Array) -> StickingPoint:
         """Build the system from ``kkt = [M, −J_sᵀ; J_s, εI]``, the world ``J``, and ``mobility = JM⁻¹Jᵀ``, 1/kg.
 
-        ``mobile`` is True for the velocity entries of joints that are not locked, shape (nv,).
+        ``projector`` projects onto the velocities that can change (:attr:`Robot.projector`), shape (nv, nv).
         """
         values, vectors = np.linalg.eigh((mobility + mobility.T) / 2)
         kept = values > SINGULAR * max(float(values[-1]), 1e-300)
@@ -54,7 +53,7 @@ class StickingPoint:
         system[:size, :size] = kkt
         system[size:, :nv] = axes.T @ J
         system[:nv, size:] = -system[size:, :nv].T
-        return StickingPoint(system, axes, vectors[:, ~kept], mobile)
+        return StickingPoint(system, axes, vectors[:, ~kept], projector)
 
     def can_move(self, n: Array) -> bool:
         """Return whether the point can move along ``n``."""
@@ -65,14 +64,15 @@ class StickingPoint:
 
         The generalized impulse ``tau`` and the point velocity ``velocity`` are zero by default.
         """
-        right, nv = np.zeros(len(self.system)), len(self.mobile)
+        right, nv = np.zeros(len(self.system)), len(self.projector)
         size = len(right) - self.axes.shape[1]
         if tau is not None:
-            right[:nv] = tau * self.mobile
+            right[:nv] = self.projector.T @ tau
         if velocity is not None:
             right[size:] = self.axes.T @ velocity
         solution = np.asarray(np.linalg.solve(self.system, right), dtype=np.float64)
-        return ImpulseResponse(solution[:nv], solution[nv:size]), np.asarray(self.axes @ solution[size:])
+        response = ImpulseResponse(self.projector @ solution[:nv], solution[nv:size])
+        return response, np.asarray(self.axes @ solution[size:])
 
 
 def no_sticking() -> MetricError:

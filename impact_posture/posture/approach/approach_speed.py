@@ -46,7 +46,7 @@ class ApproachSpeed(Constraint):
     @property
     def structure(self) -> str:
         attainable = self._attainable
-        parts: list[object] = [self.parameters.shape, self._kept, attainable.free, attainable.scale]
+        parts: list[object] = [self.parameters.shape, self._kept, attainable.moves]
         for moved in attainable.points:
             parts += [moved.point.position, moved.point.rotation, moved.point.joint, moved.rows]
             parts += [moved.comes, moved.in_frame]
@@ -69,9 +69,8 @@ class ApproachSpeed(Constraint):
     def lift(self, tree: Tree, parameters: ca.SX) -> LiftedRows:
         attainable = self._attainable
         z = ca.SX.sym("w", len(attainable.free))
-        v = ca.SX(tree.model.nv, 1)
-        v[attainable.free.tolist()] = attainable.scale * z
-        velocities, rows, start = tree.velocities(v), [], 1
+        moves = ca.SX(ca.sparsify(ca.DM(attainable.moves)))
+        velocities, rows, start = tree.velocities(moves @ z), [], 1
         for moved in attainable.points:
             axes = ca.SX(moved.axes)
             if moved.comes:

@@ -102,22 +102,24 @@ class AttainableSpeed:
             infinite at some postures.
         free: Indices of the free velocities, the entries of ``ν`` that may be nonzero, shape (k,).
         scale: Unit of each free velocity, rad/s or m/s, shape (k,).
+        moves: Map from the free velocities in this unit to ``ν``, which includes followers, shape (nv, k).
         upper: Limit of each free velocity in this unit, shape (k,); infinite if the URDF has no limit.
     """
 
     def __init__(self, robot: Robot, objective: Objective, requirements: Requirements) -> None:
-        self._model = robot.model
+        self._model, self._coupling = robot.model, robot.coupling_matrix
         self.points = _moving_points(robot, objective, requirements)
         flies = robot.floating and not objective.supports and requirements.base != "fixed"
         joints = np.arange(robot.nv) >= (0 if flies or not robot.floating else 6)
         bringing = joints & self._chain([moved.point for moved in self.points if moved.comes])
         standing = self._chain([point_on(robot, support.frame) for support in objective.supports])
-        free = joints & self._chain([moved.point for moved in self.points])
+        free = joints & self._chain([moved.point for moved in self.points]) & ~robot.followers
         free &= ~held_rows(robot, requirements.hold).any(axis=0)
         self.free = np.flatnonzero(free)
         limit = robot.velocity_limits[self.free]
         stated = limit < FASTEST
         self.scale, self.upper = np.where(stated, limit, 1.0), np.where(stated, 1.0, np.inf)
+        self.moves = self._coupling[:, self.free] * self.scale
         self.names = [robot.tangent_names[k] for k in self.free]
         self.unknown = ""
         if robot.floating and not flies and self.points and ((bringing & standing).any() or not bringing.any()):
@@ -133,7 +135,7 @@ class AttainableSpeed:
         for point in points:
             for joint in model.supports[point.joint].tolist()[1:]:
                 moves[model.idx_vs[joint] : model.idx_vs[joint] + model.nvs[joint]] = True
-        return moves
+        return np.asarray(moves @ (self._coupling != 0))
 
     @property
     def independent(self) -> list[int]:
@@ -157,12 +159,11 @@ class AttainableSpeed:
     def jacobian(self, model: Numeric) -> Array:
         """Return the matrix that maps the scaled free velocities to the rows of all points, shape (m, k)."""
         rows = np.vstack([point.jacobian(model) for point in self.points])
-        return np.asarray(rows[:, self.free] * self.scale)
+        return np.asarray(rows @ self.moves)
 
     def by_posture(self, model: Numeric, velocities: Array, weights: Array) -> Array:
         """Return the tangent gradient, shape (nv,), of the weighted sum of all rows for constant velocities."""
-        v = np.zeros(model.model.nv)
-        v[self.free] = self.scale * velocities
+        v = self.moves @ velocities
         gradient = np.zeros(len(v))
         ends = np.cumsum([len(moved.rows) for moved in self.points])[:-1]
         for moved, weight in zip(self.points, np.split(weights, ends), strict=True):

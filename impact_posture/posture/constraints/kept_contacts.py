@@ -52,7 +52,7 @@ class KeptContacts(ExpressionConstraint):
     def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
         case = self._objective.case
         extra = support_inertia(case.robot, case.supports, case.compliance)
-        heavy = Tree(case.robot.model, tree.q, extra_inertia=extra)
+        heavy = Tree(case.robot.model, tree.q, extra_inertia=extra, couplings=case.robot.coupled_entries)
         velocities = heavy.respond(wrenches=[impact_at(case, parameters)]).velocities
         parts = [-heavy.point_velocity(foot, velocities)[:rows] / case.compliance for foot, rows in self._feet]
         return ca.densify(ca.SX(self._matrix) @ ca.vertcat(*parts))

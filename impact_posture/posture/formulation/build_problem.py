@@ -20,6 +20,7 @@ from impact_posture.posture.approach.approach_speed import ApproachSpeed
 from impact_posture.posture.approach.attainable_speed import AttainableSpeed
 from impact_posture.posture.constraints.center_of_mass_over_feet import CenterOfMassOverFeet
 from impact_posture.posture.constraints.constraint import Constraint
+from impact_posture.posture.constraints.coupled_joint import CoupledJoint
 from impact_posture.posture.constraints.pose_constraints import (
     AxisInCone,
     HeldOrientation,
@@ -34,11 +35,13 @@ from impact_posture.posture.formulation.impact_constraints import impact_constra
 from impact_posture.posture.formulation.well_posed import fix_undetermined_motions, make_well_posed
 from impact_posture.posture.loads.load_cases import LoadCases, load_cases
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem
-from impact_posture.robot.model_joints import immovable_joints
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_spec import Support
 from impact_posture.robot.support_polygon import polygon_edges
 from impact_posture.system.arrays import Array
+
+# Distance of the bounds of a follower from its limits, rad or m.
+_WIDER = 0.01
 
 
 def build_problem(robot: Robot, objective: Objective, given: Array, requirements: Requirements) -> ConstrainedProblem:
@@ -47,9 +50,7 @@ def build_problem(robot: Robot, objective: Objective, given: Array, requirements
     Raise ``InputError`` if the requirements contradict each other or do not suit the robot.
     """
     _check(robot, requirements)
-    requirements = replace(
-        requirements, hold=tuple(dict.fromkeys((*requirements.hold, *immovable_joints(robot.model))))
-    )
+    requirements = replace(requirements, hold=robot.fixed_with(requirements.hold))
     numeric = Numeric(robot.model).at(given)
     constraints: list[Constraint] = [_held_support(robot, numeric, support) for support in objective.supports]
     held = {s.frame for s in objective.supports}
@@ -87,7 +88,7 @@ def build_problem(robot: Robot, objective: Objective, given: Array, requirements
             except InputError:
                 if requirements.approach_asked:
                     raise
-    lower, upper = _bounds(Chart(robot.model), given, requirements)
+    lower, upper = _bounds(robot, given, requirements)
     loads = load_cases(objective, given, requirements) if requirements.holdable else LoadCases()
     fixed, notes = fix_undetermined_motions(robot, objective, numeric, requirements, constraints)
     notes = [*decided, *loads.notes, *notes]
@@ -98,6 +99,7 @@ def build_problem(robot: Robot, objective: Objective, given: Array, requirements
         constraints += [*around.nested, *around.constraints]
         notes += around.notes
     constraints += [constraint for case in loads.cases for constraint in case.constraints()]
+    constraints += [CoupledJoint(robot, c) for c in robot.couplings if c.follower not in requirements.hold]
     problem = ConstrainedProblem(
         robot, objective, requirements, given, tuple(constraints), lower, upper, (), tuple(notes), around
     )
@@ -245,8 +247,9 @@ def _com_constraint(
     return CenterOfMassOverFeet(*edges, margin)
 
 
-def _bounds(chart: Chart, given: Array, requirements: Requirements) -> tuple[Array, Array]:
+def _bounds(robot: Robot, given: Array, requirements: Requirements) -> tuple[Array, Array]:
     """Return the joint limits minus the margin, in chart coordinates, shape (nx,); held joints have equal limits."""
+    chart, followers = Chart(robot.model), {c.follower for c in robot.couplings}
     lower, upper = chart.bounds()
     x = chart.to_x(given)
     margin = requirements.limit_margin
@@ -254,6 +257,10 @@ def _bounds(chart: Chart, given: Array, requirements: Requirements) -> tuple[Arr
     for slot in chart.slots:
         if slot.name in requirements.hold:
             lower[slot.x] = upper[slot.x] = x[slot.x]
+        elif slot.name in followers:
+            # The limits of the leader imply these.  Wider bounds are never active together with them.
+            lower[slot.x] -= margin + _WIDER
+            upper[slot.x] += margin + _WIDER
         elif (lower[slot.x] > upper[slot.x]).any():
             fault = f"a margin of {margin:g} leaves joint '{slot.name}' no room to move"
             raise InputError(fault, where="limit_margin", hint="give a smaller margin")

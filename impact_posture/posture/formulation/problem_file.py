@@ -87,7 +87,7 @@ def prepare(settings: ProblemSettings, impact: ResolvedImpact | None = None) -> 
             raise InputError(what, where=settings.robot, hint=impact.missing_support)
         impact = replace(impact, missing_support="")
     demands = requirements(settings, impact.objective)
-    impact = replace(impact, held=demands.hold)
+    impact = replace(impact, held=impact.robot.fixed_with(demands.hold))
     problem = build_problem(impact.robot, impact.objective, impact.q, demands)
     released = [joint for joint in held_by_default(impact.robot) if joint not in problem.requirements.hold]
     if released:

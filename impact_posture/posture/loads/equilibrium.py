@@ -70,6 +70,7 @@ class Equilibrium:
             robot, N.
         weight: The weight of the robot, N.
         limits: Largest joint torques, infinite if unknown, shape (nv,).
+        coupling: Projector ``C`` of the couplings of joints, shape (nv, nv).  The motors exert ``Cᵀτ``.
         balance: Combinations of the base wrench that the sources can balance, shape (b, 6); no rows for a fixed base.
         thrusts: Thrusts of rotors that are not among the sources.
         names: Names of the entries of ``ν``.
@@ -81,6 +82,7 @@ class Equilibrium:
         sources: Sequence[ForceSource],
         weight: float,
         limits: Array,
+        coupling: Array,
         balance: Array,
         thrusts: Thrusts,
         names: Sequence[str],
@@ -91,7 +93,7 @@ class Equilibrium:
         self._free = np.flatnonzero(np.isfinite(self.load.upper))
         half, middle = (thrusts.upper - thrusts.lower) / 2, (thrusts.upper + thrusts.lower) / 2
         base = np.vstack([balance / weight, thrusts.matrix / half[:, None]])
-        torque = np.diag(1 / limits)[bounded]
+        torque = np.diag(1 / limits)[bounded] @ coupling.T
         self.rows = np.vstack([np.zeros((len(base), model.nv)), torque])
         self.rows[: len(base), :6] = base[:, : model.nv]
         self.offset = np.zeros(len(self.rows))

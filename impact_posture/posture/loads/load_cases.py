@@ -20,7 +20,6 @@ from impact_posture.posture.loads.holdable import Holdable, ReachableWrench
 from impact_posture.posture.loads.holding_forces import HoldingForces
 from impact_posture.posture.loads.static_load import ForceSource, StaticLoad
 from impact_posture.robot.actuation import allocation_matrix, thrust_limits, torque_limits
-from impact_posture.robot.model_joints import finite_armature
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 
@@ -90,7 +89,8 @@ def load_cases(objective: Objective, q: Array, requirements: Requirements) -> Lo
     weight = robot.mass * float(np.linalg.norm(robot.model.gravity.linear))
     rotors = _rotors(robot, weight, share) if robot.floating else []
     feet = _feet(objective, weight, requirements.friction) if robot.floating else []
-    limits = share * torque_limits(robot.model)
+    # The motor of the leader also moves its followers, which have no motors.
+    limits = np.where(robot.followers, np.inf, share * torque_limits(robot.model))
     reach, rank = _reach(StaticLoad(robot.model, [*rotors, *feet]), q) if robot.floating else (np.zeros((0, 6)), 0)
     unknown = ""
     if robot.floating and not (rotors or feet):
@@ -120,7 +120,9 @@ def load_cases(objective: Objective, q: Array, requirements: Requirements) -> Lo
         for pushed in (0.0, force) if force else (0.0,):
             pushes = [_push(robot, contact, pushed) for contact in objective.contacts] if pushed else []
             names = robot.tangent_names
-            rest = Equilibrium(model, [*sources, *pushes], weight, limits, balance, thrusts, names)
+            rest = Equilibrium(
+                model, [*sources, *pushes], weight, limits, robot.coupling_matrix, balance, thrusts, names
+            )
             name = (f"while it pushes with {pushed:g} N" if pushed else "at rest") + variant
             cases.append(LoadCase(name, f"{what} within {within} {name}", rest, reach[rank:]))
     return LoadCases(tuple(cases), tuple(notes))
@@ -128,10 +130,9 @@ def load_cases(objective: Objective, q: Array, requirements: Requirements) -> Lo
 
 def _unlimited(robot: Robot) -> list[str]:
     """Return notes that name the joints whose torque is not checked, because no effort limit is known."""
-    unlimited = np.isinf(torque_limits(robot.model)) & ~finite_armature(robot.model)[1]
-    slots = [
-        slot for slot in Chart.of(robot.model).slots if slot.name in robot.joint_names and unlimited[slot.v].any()
-    ]
+    unlimited = np.isinf(torque_limits(robot.model)) & robot.projector.any(axis=0)
+    unlimited[: 6 if robot.floating else 0] = False
+    slots = [slot for slot in Chart.of(robot.model).slots if unlimited[slot.v].any()]
     driven = [slot.name for slot in slots if slot.kind.family in ("revolute", "continuous", "prismatic")]
     passive = [slot.name for slot in slots if slot.name not in driven]
     limit = "an effort limit (0, or not stated); state it in robot.toml [limits.effort]"

@@ -24,7 +24,12 @@ def supported_inverse(state: State, contacts: Sequence[SupportContact]) -> Array
     Without contacts, the result is ``M⁻¹``.  Contacts with the Jacobian ``J_s`` do not move during the impact, so the
     result is ``M⁻¹ − M⁻¹J_sᵀ(J_s M⁻¹J_sᵀ)⁺J_s M⁻¹``.
     """
-    inverse = np.linalg.inv(state.M)
+    robot, M = state.robot, state.M
+    if robot.couplings:
+        C = robot.coupling_matrix
+        inverse = C @ np.linalg.inv(C.T @ M @ C + np.diag(robot.followers)) @ C.T
+    else:
+        inverse = np.linalg.inv(M)
     if not contacts:
         return np.asarray(inverse)
     held = np.vstack([state.at(c.point).jacobian[: c.size] for c in contacts])

@@ -1,0 +1,192 @@
+"""Coupled joints: a follower moves with its leader, like the fingers of a gripper with one motor.
+
+A configuration contains both joints, and ``q_follower = ratio · q_leader + offset``.  All generalized velocities
+have the form ``ν = C ν``, where the matrix ``C`` copies the leader's velocity, times the ratio, to the follower and
+ignores the follower's own entry.  ``C`` is a projector.  The dynamics of the coupled robot have the mass matrix
+``CᵀMC`` and the Jacobian ``JC`` (Featherstone 2008, section 8.4); the motor of the leader exerts ``Cᵀτ``.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.errors import UrdfError, nearest
+from impact_posture.robot.model_joints import ENDLESS
+from impact_posture.system.arrays import Array
+
+
+@dataclass(frozen=True)
+class JointCoupling:
+    """``q_follower = ratio · q_leader + offset`` for two revolute or prismatic joints, in rad or m."""
+
+    follower: str
+    leader: str
+    ratio: float
+    offset: float
+
+    def of(self, model: pin.Model, q: Array) -> float:
+        """Return the position of the follower for the position of the leader in ``q``, shape (nq,)."""
+        return self.ratio * float(q[_in_q(model, self.leader)]) + self.offset
+
+
+def composed(stated: Mapping[str, JointCoupling], where: str) -> tuple[JointCoupling, ...]:
+    """Return couplings in which no leader is a follower, for couplings by the name of the follower.
+
+    Raises:
+        UrdfError: Joints follow each other in a circle.
+    """
+    couplings = []
+    for name, coupling in stated.items():
+        passed, c = [name, coupling.leader], coupling
+        while c.leader in stated:
+            by = stated[c.leader]
+            c = JointCoupling(name, by.leader, c.ratio * by.ratio, c.offset + c.ratio * by.offset)
+            if c.leader in passed:
+                circle = " mimics ".join(f"'{joint}'" for joint in [*passed, c.leader])
+                raise UrdfError(f"joint {circle}", where=where, hint="remove one coupling")
+            passed.append(c.leader)
+        couplings.append(c)
+    return tuple(couplings)
+
+
+def urdf_couplings(root: ET.Element, where: str) -> tuple[tuple[JointCoupling, ...], list[str]]:
+    """Return the couplings that the ``<mimic>`` tags of a URDF state, and warnings about tags that state none.
+
+    The tags of coupled joints in ``root`` change.  Continuous joints become revolute joints without limits, because a
+    follower depends on the whole angle, not only on its cosine and sine.  The limits of a joint that mimics a fixed
+    joint become equal.
+
+    Raises:
+        UrdfError: Joints mimic each other in a circle, a planar or floating joint is coupled, or a number is invalid.
+    """
+    joints = {joint.get("name", ""): joint for joint in root.findall("joint")}
+    stated, warnings = dict[str, JointCoupling](), []
+    for name, joint in joints.items():
+        tag = joint.find("mimic")
+        if tag is None or joint.get("type") == "fixed":
+            continue
+        leader = tag.get("joint", "")
+        if leader not in joints:
+            fault = f"joint '{name}' mimics '{leader}', which is not a joint of the URDF"
+            near = nearest(leader, joints, 1)[0]
+            warnings.append(f"{fault} (did you mean {near}?): it moves by itself; correct its <mimic>")
+            continue
+        ratio, offset = (_number(tag, key, value, where) for key, value in (("multiplier", 1.0), ("offset", 0.0)))
+        stated[name] = JointCoupling(name, leader, ratio, offset)
+    couplings = []
+    for c in composed(stated, where):
+        if joints[c.leader].get("type") == "fixed":
+            _set_limits(joints[c.follower], c.offset, c.offset)
+            continue
+        couplings.append(c)
+        for joint in (joints[c.follower], joints[c.leader]):
+            kind = joint.get("type")
+            if kind == "continuous":
+                joint.set("type", "revolute")
+                _set_limits(joint, -2 * ENDLESS, 2 * ENDLESS)
+            elif kind not in ("revolute", "prismatic"):
+                fault = f"joint '{joint.get('name')}' of type {kind} is coupled by <mimic>"
+                raise UrdfError(fault, where=where, hint="only revolute, prismatic and continuous joints can be")
+    return tuple(couplings), warnings
+
+
+def _number(tag: ET.Element, key: str, default: float, where: str) -> float:
+    try:
+        value = float(tag.get(key, default))
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value):
+        fault = f"<mimic> of joint '{tag.get('joint')}': {key} '{tag.get(key)}' is not a number"
+        raise UrdfError(fault, where=where, hint="correct it")
+    return value
+
+
+def _set_limits(joint: ET.Element, low: float, high: float) -> None:
+    limit = joint.find("limit")
+    limit = ET.SubElement(joint, "limit", effort="0", velocity="0") if limit is None else limit
+    limit.attrib |= {"lower": str(low), "upper": str(high)}
+
+
+def present(couplings: Iterable[JointCoupling], model: pin.Model) -> tuple[JointCoupling, ...]:
+    """Return the couplings whose joints both exist in a model."""
+    return tuple(c for c in couplings if model.existJointName(c.follower) and model.existJointName(c.leader))
+
+
+def with_partners(couplings: Iterable[JointCoupling], joints: Collection[str]) -> tuple[str, ...]:
+    """Return ``joints`` and all joints that cannot move without them."""
+    chosen = dict.fromkeys(joints)
+    leaders = {c.leader for c in couplings if chosen.keys() & {c.follower, c.leader}}
+    partners = (joint for c in couplings if c.leader in leaders for joint in (c.leader, c.follower))
+    return tuple(dict.fromkeys((*chosen, *partners)))
+
+
+def couple_limits(model: pin.Model, couplings: Iterable[JointCoupling]) -> list[str]:
+    """Let position and velocity limits of followers bound their leaders; return warnings.
+
+    A follower without a range (equal limits) has no limits.
+    """
+    warnings = []
+    low, high = model.lowerPositionLimit.copy(), model.upperPositionLimit.copy()
+    slow, fast = model.lowerVelocityLimit.copy(), model.upperVelocityLimit.copy()
+    couplings = tuple(couplings)
+    for c in couplings:
+        f, lead = _in_q(model, c.follower), _in_q(model, c.leader)
+        if c.ratio and low[f] < high[f]:
+            ends = sorted((bound - c.offset) / c.ratio for bound in (low[f], high[f]))
+            if max(low[lead], ends[0]) < min(high[lead], ends[1]):
+                low[lead], high[lead] = max(low[lead], ends[0]), min(high[lead], ends[1])
+            else:
+                stated, other = f"[{low[f]:g}, {high[f]:g}]", f"[{low[lead]:g}, {high[lead]:g}]"
+                fault = f"the position limits {stated} of '{c.follower}' leave '{c.leader}' {other}, which it mimics"
+                warnings.append(f"{fault}, no range, so they are not used")
+        f, lead = _in_v(model, c.follower), _in_v(model, c.leader)
+        if c.ratio and 0 < fast[f] < ENDLESS:
+            limit = fast[f] / abs(c.ratio)
+            fast[lead] = min(fast[lead], limit) if fast[lead] > 0 else limit
+            slow[lead] = -fast[lead]
+    for c in couplings:
+        f, lead = _in_q(model, c.follower), _in_q(model, c.leader)
+        with np.errstate(over="ignore"):  # Pinocchio writes "no limit" as the largest double.
+            low[f], high[f] = sorted(c.ratio * bound + c.offset for bound in (low[lead], high[lead]))
+        f, lead = _in_v(model, c.follower), _in_v(model, c.leader)
+        fast[f] = abs(c.ratio) * fast[lead]
+        slow[f] = -fast[f]
+    model.lowerPositionLimit, model.upperPositionLimit = low, high
+    model.lowerVelocityLimit, model.upperVelocityLimit = slow, fast
+    return warnings
+
+
+def coupled_entries(model: pin.Model, couplings: Iterable[JointCoupling]) -> list[tuple[int, int, float]]:
+    """Return (entry of the follower in ν, entry of the leader, ratio) of each coupling whose joints can move."""
+    entries = [(_in_v(model, c.follower), _in_v(model, c.leader), c.ratio) for c in couplings]
+    return [entry for entry in entries if np.isfinite(model.armature[entry[0]])]
+
+
+def coupling_matrix(model: pin.Model, couplings: Iterable[JointCoupling]) -> Array:
+    """Return the projector ``C``, shape (nv, nv)."""
+    C = np.eye(model.nv)
+    for c in couplings:
+        follower = _in_v(model, c.follower)
+        C[follower, follower], C[follower, _in_v(model, c.leader)] = 0.0, c.ratio
+    return C
+
+
+def coupled(model: pin.Model, couplings: Sequence[JointCoupling], q: Array) -> Array:
+    """Return a copy of ``q``, shape (nq,), with each follower at the position that its leader requires."""
+    q = np.array(q, dtype=float)
+    for c in couplings:
+        q[_in_q(model, c.follower)] = c.of(model, q)
+    return q
+
+
+def _in_q(model: pin.Model, joint: str) -> int:
+    return int(model.idx_qs[model.getJointId(joint)])
+
+
+def _in_v(model: pin.Model, joint: str) -> int:
+    return int(model.idx_vs[model.getJointId(joint)])
