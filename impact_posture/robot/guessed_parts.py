@@ -26,7 +26,8 @@ _FINGER = re.compile(r"finger|thumb|gripper|jaw|knuckle|pinky|(?:^|_)(?:index|mi
 _TOOL = re.compile(r"tcp|tool|(?:^|_)ee(?:f|$|_)|end_?effector|grasp|tip$", re.I)
 _HAND = re.compile(r"gripper|hand|palm|flange", re.I)
 _SENSOR = re.compile(
-    r"imu|camera|optical|laser|lidar|radar|sensor|sonar|range|accelero|gyro|fsr|touch|_itb|_led|dh_frame|visual", re.I
+    r"imu|camera|optical|laser|lidar|radar|sensor|sonar|range|accelero|gyro|fsr|touch|_itb|_led|dh_frame|skin|visual",
+    re.I,
 )
 _FLYING = re.compile(r"fly|copter|drone|uav|aerial|quadrotor|hexarotor|propeller", re.I)
 

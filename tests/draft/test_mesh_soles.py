@@ -73,6 +73,20 @@ def test_the_rectangle_of_a_sole_lies_in_the_sole(tmp_path: Path) -> None:
     assert left.size == right.size
 
 
+def test_sensors_below_a_sole_are_not_feet(tmp_path: Path) -> None:
+    """On iCub, the tactile sensors of the skin are frames below the frame of the sole."""
+    frames = "".join(
+        f'<link name="{side}_{name}"/><joint name="to_{side}_{name}" type="fixed"><parent link="{side}_foot"/>'
+        f'<child link="{side}_{name}"/><origin xyz="0 0 {z}"/></joint>'
+        for side in ("left", "right")
+        for name, z in (("sole", -0.05), ("sole_skin_0", -0.06))
+    )
+    (tmp_path / "biped.urdf").write_text(biped(BOX).replace("</robot>", f"{frames}</robot>"))
+    spec = read_spec(write_draft(str(tmp_path / "biped.urdf"), LoadOptions(), None)[0])
+    assert [support.frame for support in spec.supports] == ["left_sole", "right_sole"]
+    assert {support.offset for support in spec.supports} == {(0.02, 0.0, -0.01)}
+
+
 def test_a_round_mesh_is_a_point(tmp_path: Path) -> None:
     """Two feet on legs of six joints are surfaces; a ball gives them no size."""
     for support in drafted(tmp_path, MESH.format(""), ball()).supports:
