@@ -15,16 +15,19 @@ import numpy as np
 
 from impact_posture.collision.shape_corners import Corrected, Triangles, hull_surface, triangle_mesh
 from impact_posture.collision.urdf_shapes import UnusableShape, UrdfShape, UrdfShapes, left_out
-from impact_posture.robot.mjcf_file import object_name
-from impact_posture.robot.mjcf_geoms import MjcfGeom, geoms_of
+from impact_posture.robot.mjcf_file import is_floating, object_name
+from impact_posture.robot.mjcf_model import placement
 from impact_posture.system.arrays import Array
+from impact_posture.system.optional_package import import_mujoco
+
+_NO_MESH = np.zeros((0, 3)), np.zeros((0, 3), dtype=int)
 
 
 @dataclass(frozen=True, eq=False)
 class MjcfShape(UrdfShape):
-    """A geom of an MJCF; ``surface`` has the corners, m, and the triangles of a mesh."""
+    """A geom of an MJCF; ``surface`` has the corners, m, shape (k, 3), and the triangles, shape (n, 3), of a mesh."""
 
-    surface: tuple[Array, Triangles] = (np.zeros((0, 3)), np.zeros((0, 3), dtype=int))
+    surface: tuple[Array, Triangles] = _NO_MESH
 
     @property
     def content(self) -> str:
@@ -41,26 +44,24 @@ class MjcfShape(UrdfShape):
 
 
 def mjcf_shapes(model: Any, first: str = "collision") -> UrdfShapes:
-    """Return the solid geoms of an ``MjModel``; with ``first="visual"``, the visual geoms of bodies that have any."""
-    read, bodies = UrdfShapes([], [], []), dict[str, list[MjcfGeom]]()
-    for geom in geoms_of(model):
-        bodies.setdefault(geom.body, []).append(geom)
-    for body, geoms in bodies.items():
-        chosen = [geom for geom in geoms if geom.solid]
-        if first == "visual":
-            chosen = [geom for geom in geoms if not geom.solid] or chosen
+    """Return the solid geoms of an ``MjModel``; with ``first="visual"``, the visual geoms of bodies that have any.
+
+    The world of a fixed robot has the shapes of its base.  The surroundings of a floating robot are not its shapes.
+    """
+    read, pairs = UrdfShapes([], [], []), {*map(int, model.pair_geom1), *map(int, model.pair_geom2)}
+    for b in range(int(is_floating(model)), model.nbody):
+        geoms = range(model.body_geomadr[b], model.body_geomadr[b] + model.body_geomnum[b])
+        solid = [g for g in geoms if model.geom_contype[g] or model.geom_conaffinity[g] or g in pairs]
+        visual = [g for g in geoms if g not in solid] if first == "visual" else []
+        chosen, body = visual or solid, object_name(model, "body", b)
         if chosen:
             read.described.append(body)
-        for k, geom in enumerate(chosen):
+        for k, g in enumerate(chosen):
             name = body if len(chosen) == 1 else f"{body}[{k}]"
-            if not geom.sizes:
-                fault = UnusableShape(f"a {geom.kind} is not a shape of a link; give primitives or meshes")
+            try:
+                read.shapes.append(_shape(model, g, name, body, hull=first == "collision"))
+            except UnusableShape as fault:
                 read.warnings.append(left_out(name, fault))
-                continue
-            surface = hull_surface(geom.mesh[0]) if geom.kind == "mesh" and first == "collision" else geom.mesh
-            read.shapes.append(
-                MjcfShape(name, body, geom.placement, geom.kind, geom.sizes, color=geom.color, surface=surface)
-            )
     return read
 
 
@@ -77,3 +78,36 @@ def disabled_bodies(model: Any) -> set[frozenset[str]]:
         if weld[a] == weld[b] or parent[a] == weld[b] or parent[b] == weld[a]:
             pairs.add(frozenset((names[a], names[b])))
     return pairs
+
+
+def _shape(model: Any, g: int, name: str, body: str, *, hull: bool) -> MjcfShape:
+    """Return a geom as the shape ``name``; raise ``UnusableShape`` for planes, height fields and other surfaces."""
+    kind = import_mujoco().mjtGeom(int(model.geom_type[g])).name.removeprefix("mjGEOM_").lower()
+    x, y, z = (float(v) for v in model.geom_size[g])
+    known = {
+        "sphere": (x,),
+        "capsule": (x, 2 * y),
+        "cylinder": (x, 2 * y),
+        "ellipsoid": (x, y, z),
+        "box": (2 * x, 2 * y, 2 * z),
+        "mesh": (1.0, 1.0, 1.0),
+    }
+    if kind not in known:
+        raise UnusableShape(f"a {kind} is not a shape of a link; give {', '.join(known)}")
+    surface = _mesh(model, int(model.geom_dataid[g])) if kind == "mesh" else _NO_MESH
+    surface = hull_surface(surface[0]) if kind == "mesh" and hull else surface
+    at, color = placement(model.geom_pos[g], model.geom_quat[g]), _color(model, g)
+    return MjcfShape(name, body, at, kind, known[kind], color=color, surface=surface)
+
+
+def _color(model: Any, g: int) -> tuple[float, ...]:
+    """Return the color of a geom; a geom with MuJoCo's default color has the color of its material."""
+    color, material = model.geom_rgba[g], int(model.geom_matid[g])
+    if material >= 0 and np.allclose(color, (0.5, 0.5, 0.5, 1.0)):
+        color = model.mat_rgba[material]
+    return tuple(float(v) for v in color)
+
+
+def _mesh(model: Any, k: int) -> tuple[Array, Triangles]:
+    corners = model.mesh_vert[model.mesh_vertadr[k] :][: model.mesh_vertnum[k]]
+    return corners.astype(float), model.mesh_face[model.mesh_faceadr[k] :][: model.mesh_facenum[k]].astype(int)

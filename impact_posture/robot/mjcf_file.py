@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +18,8 @@ from impact_posture.system.arrays import Array
 from impact_posture.system.optional_package import import_mujoco, unwarned
 
 _STATED, _FROM_GEOMS = "in a copy of the file", 1
+# Root element of a file that only works as a part of another file.
+_PART = "mujocoinclude"
 
 
 class MjcfFile(NamedTuple):
@@ -38,10 +41,10 @@ class MjcfFile(NamedTuple):
 
 
 def is_mjcf(path: Path) -> bool:
-    """Return whether the root element of a file is ``<mujoco>``; ``False`` for an unreadable file."""
+    """Return whether the root of a file is ``<mujoco>`` or ``<mujocoinclude>``; ``False`` if it is unreadable."""
     try:
         with path.open("rb") as file:
-            return bool(next(ET.iterparse(file, ("start",)))[1].tag == "mujoco")
+            return next(ET.iterparse(file, ("start",)))[1].tag in ("mujoco", _PART)
     except (OSError, ValueError, ET.ParseError, StopIteration):
         return False
 
@@ -54,9 +57,12 @@ def read_mjcf(path: Path, root: Root | None) -> MjcfFile:
         InputError: MuJoCo is not installed.
     """
     mujoco = import_mujoco()
-    with unwarned():
+    with unwarned(), warnings.catch_warnings(action="ignore"):
         try:
             spec = mujoco.MjSpec.from_file(str(path))
+            if len(spec.bodies) < 2:  # The first body is the world.
+                hint = "name the file of a robot, or the file that includes this part"
+                raise MjcfError("has no body", where=str(path), hint=hint)
             spec.compiler.fusestatic = False
             model, notes = _compile(spec, path)
             keyframes = _keyframes(model)
@@ -64,7 +70,7 @@ def read_mjcf(path: Path, root: Root | None) -> MjcfFile:
             if root is not None and (root == "free-flyer") != bool(free):
                 model = _rerooted(spec, free, path)
         except (ValueError, UnicodeError, mujoco.FatalError) as error:
-            hint = "correct the file, or try it in MuJoCo's `simulate`"
+            hint = "correct the file, or name the file that includes it"
             raise MjcfError(f"MuJoCo refuses it ({error})", where=str(path), hint=hint) from None
     _check_tree(model, path)
     couplings = _couplings(model, path)
@@ -84,7 +90,9 @@ def drives_joint(model: Any, actuator: int) -> bool:
 
 
 def _compile(spec: Any, path: Path) -> tuple[Any, list[str]]:
-    """Compile a spec without textures, and without missing meshes if all inertias are stated."""
+    """Compile a spec without textures and sensors, and without missing meshes if all inertias are stated."""
+    for sensor in list(spec.sensors):  # Sensors of a robot may need geoms of its scene.
+        spec.delete(sensor)
     for texture in spec.textures:
         texture.file, texture.cubefiles = "", [""] * 6
         texture.builtin, texture.width, texture.height = import_mujoco().mjtBuiltin.mjBUILTIN_FLAT, 1, 1
@@ -232,4 +240,4 @@ def _left_out(model: Any) -> Iterator[str]:
     }
     parts = [f"{what} ({count})" for what, count in counts.items() if count]
     if parts:
-        yield f"these parts of the MJCF have no effect here: {', '.join(parts)}"
+        yield f"the model of an impact leaves out these parts of the MJCF: {', '.join(parts)}"

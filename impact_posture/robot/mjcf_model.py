@@ -117,7 +117,7 @@ def _inertia(mjcf: Any, b: int) -> pin.Inertia:
 def _set_limits(model: pin.Model, mjcf: Any) -> None:
     """Set limits of position and torque; MJCF states no limits of velocity."""
     lower, upper = np.array(model.lowerPositionLimit), np.array(model.upperPositionLimit)
-    effort = np.array(model.effortLimit)
+    effort = np.full(model.nv, np.inf)
     for j, largest in enumerate(_efforts(mjcf)):
         at = q_slice(model, j + 1)
         if model.nqs[j + 1] == 1 and mjcf.jnt_limited[j]:
@@ -125,7 +125,7 @@ def _set_limits(model: pin.Model, mjcf: Any) -> None:
         elif model.nqs[j + 1] > 1:
             at = slice(max(at.start, at.stop - 4), at.stop)
             lower[at], upper[at] = -_UNIT, _UNIT
-        if model.nvs[j + 1] == 1 and np.isfinite(largest):
+        if model.nvs[j + 1] == 1:
             effort[model.idx_vs[j + 1]] = largest
     model.lowerPositionLimit, model.upperPositionLimit = lower, upper
     model.upperEffortLimit, model.lowerEffortLimit = effort, -effort

@@ -15,6 +15,7 @@ from impact_posture.collision.shape_corners import shape_points
 from impact_posture.collision.shape_pairs import disabled_links
 from impact_posture.config.problem_settings import LoadOptions
 from impact_posture.draft.draft import write_draft
+from impact_posture.dynamics.mjcf import build_mjcf
 from impact_posture.dynamics.mjcf_layout import file_layout
 from impact_posture.errors import InputError, MjcfError
 from impact_posture.impact.impact_contact import ImpactContact
@@ -22,7 +23,8 @@ from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.verification.verification import verify
-from tests.support.helpers import mass_matrix, rng
+from tests.support.helpers import frame_placement, mass_matrix, rng
+from tests.support.helpers import robot as known_robot
 from tests.support.mjcfs import ALL, ARM, MESH, ODD, QUADRUPED
 
 mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")
@@ -75,6 +77,24 @@ def test_mass_matrix_and_frames_are_those_of_mujoco(tmp_path: Path, name: str) -
             assert np.allclose(at.rotation.ravel(), there.xmat, atol=1e-13)
 
 
+@pytest.mark.parametrize("name", ["panda", "tilthex_arm", "solo8", "talos"])
+def test_an_mjcf_written_from_a_robot_is_the_same_robot(tmp_path: Path, name: str) -> None:
+    robot = known_robot(name)
+    mjcf = build_mjcf(robot.model)
+    mjcf.compile()
+    copied = loaded(tmp_path, mjcf.spec.to_xml())
+    assert copied.root == robot.root and copied.joint_names == robot.joint_names
+    assert np.allclose(copied.armature, robot.armature, rtol=1e-5)
+    for name in ("lowerPositionLimit", "upperPositionLimit"):
+        assert np.allclose(getattr(copied.model, name)[7:], getattr(robot.model, name)[7:], atol=1e-5)
+    q = robot.posture()
+    M = mass_matrix(robot.model, q)
+    assert np.abs(mass_matrix(copied.model, q) - M).max() < 1e-5 * np.abs(M).max()
+    frame = robot.spec.contact.frame or robot.frame_names[-1]
+    places = [frame_placement(each.model, q, each.frame_id(frame)) for each in (robot, copied)]
+    assert places[0].isApprox(places[1], 1e-5)
+
+
 def test_positions_are_those_of_qpos(tmp_path: Path) -> None:
     arm, home = loaded(tmp_path, ARM), own(ARM).key("home").qpos
     assert arm.default_posture == "home" and list(arm.postures) == ["home", "key1", "neutral"]
@@ -93,7 +113,7 @@ def test_limits_efforts_and_armature(tmp_path: Path) -> None:
     assert list(model.names[1:]) == ["shoulder", "elbow", "wrist", "reach"]
     assert np.allclose(arm.armature, [0.2 + 5**2 * 0.01, 0.1, 0, 0]) and arm.armature_source == "MJCF"
     # A motor has gear × control; actuatorfrcrange limits the sum; a servo without a force range has no limit.
-    assert np.allclose(model.effortLimit[[0, 1, 3]], [50, 20, 24]) and model.effortLimit[2] > 1e100
+    assert np.allclose(model.effortLimit[[0, 1, 3]], [50, 20, 24]) and np.isinf(model.effortLimit[2])
     assert np.isinf(arm.velocity_limits).all()
     assert np.allclose([model.lowerPositionLimit[0], model.upperPositionLimit[1]], [-2, 2.5])
     assert model.joints[3].shortname() == "JointModelRUBX"
@@ -206,7 +226,9 @@ _TENDON = '<fixed name="cord"{}><joint joint="shoulder" coef="1"/><joint joint="
         (_with(ARM, tendon=_TENDON.format(' armature="1"')), "the armature of tendon 'cord' couples joints"),
         (QUADRUPED.replace("</worldbody>", '<body name="ball"><freejoint/><geom size=".1"/></body></worldbody>')
          .replace("<key ", "<!--").replace('0 .5 .9 "/>', "-->"), "body 'ball' floats beside the robot"),
-        ("<mujoco><worldbody/></mujoco>", "has no movable joint"),
+        ("<mujoco><worldbody/></mujoco>", "has no body"),
+        ("<mujocoinclude><worldbody><body/></worldbody></mujocoinclude>", "name the file that includes"),
+        ('<mujoco><worldbody><body><geom size="1"/></body></worldbody></mujoco>', "has no movable joint"),
         ("<mujoco><nothing/></mujoco>", "MuJoCo refuses it"),
         ("<mujoco><worldbody>", "MuJoCo refuses it"),
     ],

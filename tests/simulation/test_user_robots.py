@@ -10,9 +10,11 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from impact_posture.dynamics.mjcf import build_mjcf
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import ImpactPostureError
 from impact_posture.impact.impact_contact import point_on
+from impact_posture.robot.robot_loader import load_robot
 from impact_posture.simulation.controllers.controller_factory import CONTROLLERS, ControllerFactory
 from impact_posture.simulation.metrics import measure
 from impact_posture.simulation.prediction import predict
@@ -113,6 +115,12 @@ def arm(folder: Path, which: str) -> ControllerFactory:
     if which == "rail_arm":
         shutil.copytree(RAIL, folder / "rail")
         name = "rail/rail_arm.urdf"
+    elif which == "mjcf":
+        mjcf = build_mjcf(load_robot(str(RAIL / "rail_arm.urdf")).model)
+        mjcf.compile()
+        (folder / "rail.xml").write_text(mjcf.spec.to_xml(), encoding="utf-8")
+        shutil.copy(RAIL / "robot.toml", folder / "rail.toml")
+        name, more = "rail.xml", 'config = "rail.toml"'
     elif which == "stranger":
         # The folder of the URDF contains no robot.toml.
         shutil.copy(RAIL / "rail_arm.urdf", folder / "stranger.urdf")
@@ -135,7 +143,7 @@ def standing(folder: Path, name: str, force: float) -> ControllerFactory:
 @pytest.mark.parametrize(
     ("which", "controller"),
     [("stranger", c) for c in CONTROLLERS]
-    + [(w, c) for w in ("panda", "rail_arm") for c in ("nominal", "robust", "walker")],
+    + [(w, c) for w in ("panda", "rail_arm", "mjcf") for c in ("nominal", "robust", "walker")],
 )
 def test_an_arm_on_a_fixed_base_meets_a_table(folder: Path, which: str, controller: str) -> None:
     factory = arm(folder, which)

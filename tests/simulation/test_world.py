@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.actuation import actuation_matrix, hover
 from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_loader import load_robot
 from impact_posture.simulation.world.actuator_command import ActuatorCommand, Push, Truth
 from impact_posture.simulation.world.contact_law import ContactLaw
 from impact_posture.simulation.world.scene import Physics, Scene, Sensors, Shape, Surface
@@ -22,6 +24,7 @@ from impact_posture.simulation.world.world_builder import build_scene
 from tests.dynamics.test_mjcf import qacc
 from tests.support.helpers import NAMES, Vector, assert_close, mass_matrix, random_configurations, rng
 from tests.support.helpers import robot as known_robot
+from tests.support.mjcfs import ARM as MJCF_ARM
 from tests.support.restitution import ball
 
 mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")
@@ -65,6 +68,24 @@ def test_shapes_surfaces_and_actuators_do_not_change_the_dynamics(name: str) -> 
         assert_close(T.T @ M @ T, mass_matrix(robot.model, q), 1e-9, "M")
         a = pin.aba(robot.model, robot.model.createData(), q, v, G @ u)
         assert_close(data.qacc, qacc(layout, q, v, a), 1e-9, "acceleration")
+
+
+def test_joints_of_an_mjcf_have_its_passive_forces(tmp_path: Path) -> None:
+    text = MJCF_ARM.replace('damping="1"', 'damping="1 .2" stiffness="3 .5" springref=".2"')
+    (tmp_path / "arm.xml").write_text(text)
+    robot = load_robot(str(tmp_path / "arm.xml"), lock=("shoulder",))
+    built = build_scene(robot, Scene(), robot.posture()).mjcf
+    source, model = mujoco.MjModel.from_xml_string(text), built.compile()
+    own, ours = mujoco.MjData(source), mujoco.MjData(model)
+    for q in random_configurations(robot.model, 3, "passive"):
+        v = rng("passive").normal(size=robot.nv)
+        ours.qpos[:], ours.qvel[:] = built.layout.qpos(q), v
+        own.qpos[:], own.qvel[:] = np.r_[0.5, ours.qpos], np.r_[0, v]
+        mujoco.mj_forward(model, ours)
+        mujoco.mj_forward(source, own)
+        assert np.abs(ours.qfrc_passive[0]) > 0.1
+        assert_close(ours.qfrc_passive, own.qfrc_passive[1:], 1e-12, "passive forces")
+    assert np.array_equal(model.dof_frictionloss, [0, 0.1, 0])
 
 
 def flight(timestep: float, seconds: float = 0.2) -> tuple[Robot, Truth, Truth]:

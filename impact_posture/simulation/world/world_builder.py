@@ -19,6 +19,7 @@ from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import InputError, UnsupportedJoint
 from impact_posture.impact.impact_contact import point_on
 from impact_posture.robot.actuation import actuation_matrix
+from impact_posture.robot.model_joints import joint_range
 from impact_posture.robot.robot import Robot
 from impact_posture.simulation.world.contact_law import ContactLaw
 from impact_posture.simulation.world.scene import Physics, Scene, Shape, Surface
@@ -73,6 +74,7 @@ def build_scene(robot: Robot, scene: Scene, q: Array, throw: Throw | None = None
     numeric = Numeric(robot.model).at(q)
     mjcf = build_mjcf(robot.model, robot.name)
     _set_physics(mjcf.spec, scene.physics)
+    _set_passive(mjcf, robot)
     for c in robot.couplings:
         mjcf.couple(robot.joint_id(c.follower), robot.joint_id(c.leader), c.ratio, c.offset)
     normals = {s.name: np.array(s.normal, dtype=float) / np.linalg.norm(s.normal) for s in scene.surfaces}
@@ -147,6 +149,20 @@ def _set_physics(spec: Any, physics: Physics) -> None:
         spec.option.gravity = physics.gravity
     for joint in spec.joints:
         joint.solref_limit, joint.solimp_limit = physics.stop_solref, (*physics.stop_solimp, *_SOLIMP_SHAPE)
+
+
+def _set_passive(mjcf: Mjcf, robot: Robot) -> None:
+    """Give the joints damping, friction loss and springs of the MJCF from which the robot was loaded."""
+    if robot.mjcf is None:
+        return
+    source = robot.mjcf.model
+    for index in joint_range(robot.model):
+        j = robot.mjcf.joints.getJointId(robot.model.names[index]) - 1
+        dof, joint = source.jnt_dofadr[j], mjcf.spec.joint(mjcf.joints[index][0])
+        joint.damping = np.r_[source.dof_damping[dof], source.dof_dampingpoly[dof]]
+        joint.frictionloss = source.dof_frictionloss[dof]
+        joint.stiffness = np.r_[source.jnt_stiffness[j], source.jnt_stiffnesspoly[j]]
+        joint.springref = source.qpos_spring[source.jnt_qposadr[j]]
 
 
 def _placement(robot: Robot, numeric: Numeric, shape: Shape, normal: Array | None) -> pin.SE3:
