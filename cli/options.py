@@ -68,6 +68,7 @@ Prefix = Annotated[
 ExportOut = Annotated[str | None, out_option("Folder of the C code.", "./PREFIX-c")]
 Float = Annotated[bool, option("--float", OUTPUT, "Use float instead of double in the C code.")]
 Portable = Annotated[bool, option("--portable", OUTPUT, "Write C99 without vector types, for any compiler.")]
+Cuda = Annotated[bool, option("--cuda", OUTPUT, "Also write the functions as CUDA code, with kernels for batches.")]
 CompileLibrary = Annotated[bool, option("--compile", OUTPUT, "Build the shared library and check its numbers.")]
 ControllerKind = Annotated[
     Literal["aerial", "legged", "arm"] | None,

@@ -37,6 +37,7 @@ def codegen(
     out: options.ExportOut = None,
     float_: options.Float = False,
     portable: options.Portable = False,
+    cuda: options.Cuda = False,
     compile: options.CompileLibrary = False,
     controller: options.ControllerKind = None,
     flow: options.ControllerFlow = False,
@@ -46,15 +47,15 @@ def codegen(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    from_result = typed.is_result(robot, {"prefix", "out", "float_", "portable", "compile", "force"})
+    from_result = typed.is_result(robot, {"prefix", "out", "float_", "portable", "cuda", "compile", "force"})
     if controller is None:
         if flow or scenario is not None or daqp is not None:
             what = "--flow, --scenario and --daqp belong to --controller"
             raise UsageError(f"{what}: give --controller aerial, legged or arm.")
         if not from_result:
             _check_problem(typed, robot)
-    elif float_ or portable:
-        raise UsageError("--controller always writes C99 with double: leave --float and --portable out.")
+    elif float_ or portable or cuda:
+        raise UsageError("--controller always writes C99 with double: leave --float, --portable and --cuda out.")
     page, warnings = Page(json=json, quiet=quiet), tuple[str, ...]()
     written: ControllerExport | Export
     place = Path(out) if out else None
@@ -77,7 +78,7 @@ def codegen(
         with page.progress("writing and compiling" if compile else "writing"):
             written = write_export(
                 objectives, place, prefix=prefix, posture=optimum, compression=squeezed, single=float_,
-                portable=portable, build=compile, force=force,
+                portable=portable, cuda=cuda, build=compile, force=force,
             )  # fmt: skip
         where = ", ".join(contact.frame for o in objectives for contact in o.contacts)
         title = f"{objectives[0].robot.name} at {where}", f"objective {objectives[0].name}"

@@ -146,7 +146,8 @@ class ImpactObjective(WorstCaseObjective):
         Args:
             out: The folder.
             build: Whether to build and check the library, if a C compiler is installed.
-            options: Options of :func:`write_export`: ``prefix``, ``posture``, ``single``, ``portable`` and ``force``.
+            options: Options of :func:`write_export`: ``prefix``, ``posture``, ``single``, ``portable``, ``cuda`` and
+                ``force``.
         """
         from impact_posture.codegen.existing_export import existing_export
         from impact_posture.codegen.export import write_export

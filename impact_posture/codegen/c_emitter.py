@@ -48,8 +48,8 @@ class BlockText:
 class Constants:
     """C tables of the constants of a library, because a reference to a table is shorter than the number."""
 
-    def __init__(self, prefix: str, real: Real) -> None:
-        self._prefix, self._real = prefix, real
+    def __init__(self, prefix: str, real: Real, qualifiers: str = "static const") -> None:
+        self._prefix, self._real, self._qualifiers = prefix, real, qualifiers
         self._tables: dict[int, dict[tuple[float, ...], int]] = {}
 
     def place(self, node: Node) -> str:
@@ -70,7 +70,7 @@ class Constants:
                 rows = ["{" + row + "}" for row in rows]
             body = ",\n".join(f"  {row}" for row in rows)
             name = f"{self._prefix}_{_short(width).lower()}"
-            lines.append(f"static const {types[width]} {name}[{len(known)}] = {{\n{body}\n}};")
+            lines.append(f"{self._qualifiers} {types[width]} {name}[{len(known)}] = {{\n{body}\n}};")
             lines.append(f"#define {_short(width)} {name}")
         return "\n".join([*lines, ""])
 
@@ -160,7 +160,7 @@ class Emitter:
         title = f"{self._prefix}_block{number}"
         local = sum(self._graph.nodes[k].width for k in names) * self._size
         return BlockText(
-            f"APART static void {title}({', '.join(parameters)})\n{{\n{body}\n}}\n",
+            f"APART void {title}({', '.join(parameters)})\n{{\n{body}\n}}\n",
             f"{title}({', '.join(arguments)});",
             local,
             _HALVES * self._vector_bytes(block),

@@ -18,7 +18,7 @@ _C_HEADERS = frozenset(
 def products(prefix: str) -> tuple[str, ...]:
     """Return the files that the Makefile of an export, or a program that loads the export, creates in its folder."""
     library = f"lib{prefix}.so"
-    return ("example", "example_cpp", f"{prefix}.o", library, f"{library}.sha256")
+    return ("example", "example_cpp", "example_cuda", f"{prefix}.o", library, f"{library}.sha256")
 
 
 def c_identifier(robot: str, frame: str) -> str:

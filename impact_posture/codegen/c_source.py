@@ -1,8 +1,8 @@
-"""Generate the C code that ``templates/source.c.jinja`` inserts: functions of an export, blocks, and batches."""
+"""Generate the C and CUDA code that templates insert: functions of an export, their blocks, and batches."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -32,6 +32,28 @@ _SPILL = 2
 # while the block computes one group of configurations after the other.
 _BATCH_BLOCK = 60
 
+# Largest number of operations of a CUDA function whose blocks are inlined, so that its values can be in registers.  With
+# longer functions, the compiler stores more values in memory than separate blocks do.
+_INLINED = 6000
+# Largest size of a table in the constant memory of a GPU, bytes.  The memory has 64 KiB.
+_CONSTANT_MEMORY = 60_000
+
+
+@dataclass(frozen=True)
+class CudaSource:
+    """CUDA code of all functions of an export.  Each function has its own blocks.
+
+    Attributes:
+        inlined: Whether the blocks are inlined.
+        constants: Definitions of the tables of constants.
+        functions: Template variables of each function: those of :attr:`CSource.functions`, and ``blocks``, ``angles``
+            and ``work`` (length of the work array).
+    """
+
+    inlined: bool
+    constants: str
+    functions: tuple[dict[str, Any], ...]
+
 
 @dataclass(frozen=True)
 class CSource:
@@ -52,6 +74,7 @@ class CSource:
             the objective to ``H``; empty if the ratio is not constant), and ``blocks``.  With blocks also ``angles``,
             ``room``, ``work`` and ``outputs``.  Without blocks, the batch is a loop over single calls.
         stack_bytes: Upper bound on the stack that a call uses, in bytes, without the functions of the C library.
+        cuda: CUDA code of the same functions; ``None`` if it was not requested.
     """
 
     portable: bool
@@ -63,28 +86,35 @@ class CSource:
     functions: tuple[dict[str, Any], ...]
     batches: tuple[dict[str, Any], ...]
     stack_bytes: int
+    cuda: CudaSource | None = None
 
 
-def build_c_source(exported: Sequence[NamedObjective], prefix: str, real: Real, *, portable: bool = False) -> CSource:
+def build_c_source(
+    exported: Sequence[NamedObjective], prefix: str, real: Real, *, portable: bool = False, cuda: bool = False
+) -> CSource:
     """Generate the C code of the objectives of one robot, or read the code from the cache of the user.
 
-    ``portable`` code does not use vectors, so compilers other than GCC and Clang can compile it.
+    ``portable`` code does not use vectors, so compilers other than GCC and Clang can compile it.  With ``cuda``, also
+    generate CUDA code.
     """
     library = export_library(exported)
     models = [
         (v.stem, v.joint, v.free, v.objective.contact, v.objective.scale, v.objective.is_multiple_of_H)
         for v in exported
     ]
-    content = (library.constants, library.seeds, library.functions, models, prefix, real, portable)
+    content = (library.constants, library.seeds, library.functions, models, prefix, real, portable, cuda)
     key = source_key([ca.CasadiMeta.version(), repr(content), library.function.serialize()], "codegen")
-    return cached("code", key, CSource, lambda: _generate(exported, library, prefix, real, portable=portable))
+    return cached(
+        "code", key, CSource, lambda: _generate(exported, library, prefix, real, portable=portable, cuda=cuda)
+    )
 
 
 def _generate(
-    exported: Sequence[NamedObjective], library: ExportLibrary, prefix: str, real: Real, *, portable: bool
+    exported: Sequence[NamedObjective], library: ExportLibrary, prefix: str, real: Real, *, portable: bool, cuda: bool
 ) -> CSource:
     single = [v for v in exported if not v.joint]
-    contacts = {v.stem: v.objective.contact for v in single}
+    # The code of an objective of several contacts contains the normal of its first contact.
+    normals = {v.stem: (single[0] if v.joint else v).objective.contact.normal for v in exported}
     robot = single[0].objective.robot
     scalars = library.graph()
     # In a single call, the processor waits for the results of operations, so a good order of sums saves time.  In a
@@ -100,18 +130,9 @@ def _generate(
     room = max(1, -(-len(angles) // whole)) * whole
     functions = []
     for number, function in enumerate(library.functions):
-        inputs, results = SIGNATURES[function.name]
-        sizes = [len(graph.outputs[output]) for output in function.outputs]
         blocks = zip(layout.blocks, emitter.blocks, strict=True)
-        functions.append({
-            "stem": function.stem,
-            "name": function.name,
-            # The template variables of an objective of several contacts contain the normal of its first contact.
-            "normal": None if "n" in inputs else contacts.get(function.stem, single[0].objective.contact).normal,
-            "calls": [text.call for block, text in blocks if number in block.functions],
-            "outputs": [*_outputs(function, emitter, "m.")],
-            "finite": [*zip(results, sizes, strict=True)],
-        })  # fmt: skip
+        calls = [text.call for block, text in blocks if number in block.functions]
+        functions.append(_variables(function, emitter, calls, normals))
     numbers = sum(width * count for width, count in layout.sizes.items()) + 3 * room
     frames = [max(_SPILL * b.local_bytes, b.local_bytes + b.wide_bytes) for b in emitter.blocks]
     largest = real.size * numbers + max(frames, default=0)
@@ -132,8 +153,40 @@ def _generate(
     stack_bytes = -(-(largest + _FRAMES) // 64) * 64
     return CSource(
         portable, constants.text(types), tuple(emitter.blocks), angles, room, tuple(work), tuple(functions),
-        tuple(batches), stack_bytes,
+        tuple(batches), stack_bytes, _cuda(library, scalars, normals, prefix, real) if cuda else None,
     )  # fmt: skip
+
+
+def _cuda(
+    library: ExportLibrary, scalars: Graph, normals: Mapping[str, Sequence[float]], prefix: str, real: Real
+) -> CudaSource:
+    graph = reorder_sums(scalars)
+    whole = [lay_out(graph, [function.outputs], len(graph.nodes)) for function in library.functions]
+    inlined = max(len(layout.inlined) + len(layout.blocks[0].nodes) for layout in whole if layout.blocks) <= _INLINED
+    constants = Constants(prefix, real, "static __constant__ const")
+    functions = []
+    for function, layout in zip(library.functions, whole, strict=True):
+        layout = layout if inlined else lay_out(graph, [function.outputs])
+        emitter = Emitter(layout, f"{function.stem}_{function.name}", real, {1: real.name}, constants)
+        own = {"blocks": emitter.blocks, "angles": _angles(layout), "work": layout.sizes.get(1, 0)}
+        functions.append(_variables(function, emitter, [b.call for b in emitter.blocks], normals) | own)
+    return CudaSource(inlined, constants.text({1: real.name}), tuple(functions))
+
+
+def _variables(
+    function: Exported, emitter: Emitter, calls: Sequence[str], normals: Mapping[str, Sequence[float]]
+) -> dict[str, Any]:
+    """Return the template variables of a function that computes one configuration."""
+    inputs, results = SIGNATURES[function.name]
+    sizes = [len(emitter.layout.graph.outputs[output]) for output in function.outputs]
+    return {
+        "stem": function.stem,
+        "name": function.name,
+        "normal": None if "n" in inputs else normals[function.stem],
+        "calls": calls,
+        "outputs": [*_outputs(function, emitter, "m.")],
+        "finite": [*zip(results, sizes, strict=True)],
+    }
 
 
 def _lanes(function: Exported, scalars: Graph, real: Real, constants: Constants) -> dict[str, Any]:

@@ -119,6 +119,7 @@ def export(
     compression: Compression | None = None,
     real: Real = DOUBLE,
     portable: bool = False,
+    cuda: bool = False,
     force: bool = False,
     check: bool = True,
 ) -> Export:
@@ -135,12 +136,13 @@ def export(
         compression: Duration and peak force of the impact (:class:`Compression`), for the manifest and the header.
         real: Floating-point type of the code.
         portable: Write plain C99 without vectors, for compilers other than GCC and Clang.
+        cuda: Also write ``<prefix>.cuh``, the same functions as device code with kernels for batches, and an example.
         force: Replace existing files.
         check: Compile the code, and compare its results with CasADi and Pinocchio.
 
     Raises:
-        InputError: The prefix is not a C identifier, the objectives differ in more than the contact, or the joint
-            model is ``elastic``.
+        InputError: The prefix is not a C identifier, the objectives differ in more than the contact, the joint model
+            is ``elastic``, or ``cuda`` is requested in ``float`` for a robot with supports.
         PostureError: The posture has the wrong length or is not finite.
         OutputError: ``out`` is not a folder, already contains the files, or is not writable.
         CompilerError: The compiler failed, or the results of the compiled code are wrong.  The files stay.
@@ -150,6 +152,9 @@ def export(
     if robot.joint_model == "elastic":
         what = "the joint model elastic predicts an impact at one posture, but C code must work at all postures"
         raise InputError(what, where="joint_model", hint="use the joint model link or reflected")
+    if cuda and real is FLOAT and objectives[0].supports:
+        what = "with supports, float has relative errors of 1e-2 on a GPU, because the supports are stiff"
+        raise InputError(what, where="cuda", hint="use double, or leave the supports out")
     prefix = default_prefix(objectives) if prefix is None else check_prefix(prefix)
     if not out.is_dir():
         raise OutputError("no such folder", where=str(out), hint="create it first")
@@ -159,8 +164,10 @@ def export(
         # Normalization can change the last digits of a normalized posture.  Keep the given digits, so that the code
         # contains the same numbers as result.json.
         posture = stated if np.allclose(stated, posture, rtol=0, atol=1e-9) else posture
-    exported, code = cached_code(tuple(objectives), prefix, real, portable)
-    manifest = build_manifest(objectives, prefix, posture, compression, real, code.stack_bytes, portable=portable)
+    exported, code = cached_code(tuple(objectives), prefix, real, portable, cuda)
+    manifest = build_manifest(
+        objectives, prefix, posture, compression, real, code.stack_bytes, portable=portable, cuda=cuda
+    )
     texts = render_files(exported, prefix, manifest, code, real)
     texts[f"{prefix}.json"] = json.dumps(manifest, indent=2, allow_nan=False) + "\n"
     there = [name for name in texts if (out / name).exists()]
@@ -176,11 +183,11 @@ def export(
 
 @lru_cache(maxsize=1)
 def cached_code(
-    objectives: tuple[WorstCaseObjective, ...], prefix: str, real: Real, portable: bool
+    objectives: tuple[WorstCaseObjective, ...], prefix: str, real: Real, portable: bool, cuda: bool
 ) -> tuple[tuple[NamedObjective, ...], CSource]:
     """Return the named objectives and the C code of an export, cached because generating the code is slow."""
     exported = named_objectives(objectives, prefix)
-    return exported, build_c_source(exported, prefix, real, portable=portable)
+    return exported, build_c_source(exported, prefix, real, portable=portable, cuda=cuda)
 
 
 @checked
@@ -193,6 +200,7 @@ def write_export(
     compression: Compression | None = None,
     single: bool = False,
     portable: bool = False,
+    cuda: bool = False,
     build: bool = False,
     force: bool = False,
 ) -> Export:
@@ -214,7 +222,7 @@ def write_export(
     with whole_folder(out, force=force, kind="export", products=products(prefix)) as folder:
         written = export(
             objectives, folder, prefix=prefix, posture=posture, compression=compression, real=real, portable=portable,
-            check=False,
+            cuda=cuda, check=False,
         )  # fmt: skip
         if build and find_compiler() is not None:
             try:

@@ -26,6 +26,8 @@ from impact_posture.system.escape import c_comment, markdown
 from impact_posture.version import __version__
 
 _WIDTH = 112
+# Number of threads in a block of the CUDA kernels.  The speed is the same from 32 to 256.
+_CUDA_BLOCK = 128
 
 
 class Verbatim(str):
@@ -39,14 +41,16 @@ def render_files(
 ) -> dict[str, str]:
     """Return file name → text, for every file of the export except the manifest."""
     context = _context(exported, prefix, manifest, code, real)
-    return {name: template.render(context) for name, template in load_templates(prefix).items()}
+    templates = load_templates(prefix, cuda=code.cuda is not None)
+    return {name: template.render(context) for name, template in templates.items()}
 
 
-def load_templates(prefix: str = "") -> dict[str, Template]:
+def load_templates(prefix: str = "", *, cuda: bool = False) -> dict[str, Template]:
     """Return file name → template.  The first call is slow, because it compiles the templates."""
     names = {
         f"{prefix}.h": "header.h", f"{prefix}.c": "source.c",
         **{name: name for name in ("example.c", "example.cpp", "Makefile", "CMakeLists.txt", "README.md")},
+        **({f"{prefix}.cuh": "cuda.cuh", "example.cu": "example.cu"} if cuda else {}),
     }  # fmt: skip
     package = "impact_posture.codegen"
     languages = {name: environment(package, markdown if name.endswith(".md") else c_comment) for name in names}
@@ -120,6 +124,7 @@ def _context(
     units = [part for _, part in unit_parts(objective.robot.model)]
     tests = [block["self_test"] for f in manifest["frames"] for block in (f, f["free"]) if block is not None]
     alone = len(objectives) == 1 and joint is None
+    sizes = lengths(manifest["nq"], manifest["nv"])
     return {
         "manifest": manifest,
         "code": code,
@@ -152,7 +157,11 @@ def _context(
         "units": units,
         "unit_bounds": [real.literal(float(f"{(1 + sign * real.unit_tolerance) ** 2:.12f}")) for sign in (-1, 1)],
         "macros": SHORT_NAMES,
-        "parameters": _verbatim(partial(_parameters, real, lengths(manifest["nq"], manifest["nv"]))),
+        "block": _CUDA_BLOCK,
+        "signatures": SIGNATURES,
+        "sizes": sizes,
+        "kernels": [(Verbatim(v.stem), name) for v in exported for name in (("objective",) if v.joint else SIGNATURES)],
+        "parameters": _verbatim(partial(_parameters, real, sizes)),
         "reals": _verbatim(real.initializer),
         "literals": _verbatim(lambda values: ", ".join(map(real.literal, values))),
         "frames": [_frame(v, test, alone) for v, test in zip(single, tests, strict=True)],

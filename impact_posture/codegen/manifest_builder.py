@@ -30,6 +30,7 @@ def build_manifest(
     stack_bytes: int = 0,
     *,
     portable: bool = False,
+    cuda: bool = False,
 ) -> dict[str, Any]:
     """Return the manifest of an export.
 
@@ -61,6 +62,7 @@ def build_manifest(
         "prefix": prefix,
         "real": real.name,
         "portable": portable,
+        "cuda": cuda,
         "stack_bytes": stack_bytes,
         "model_sha256": robot.model_sha256,
         "robot": robot.name,

@@ -57,7 +57,7 @@ def test_every_operation_of_the_emitter(tmp_path: Path) -> None:
     used = {function.instruction_id(k) for k in range(function.n_instructions())}
     assert set(CALLS) <= used
     text = c_function(function)
-    (tmp_path / "f.c").write_text(f"#define APART __attribute__((noinline))\n{text}")
+    (tmp_path / "f.c").write_text(f"#define APART static __attribute__((noinline))\n{text}")
     library = tmp_path / "f.so"
     command = [*compiler, "-std=c99", *STRICT, "-O2", "-fPIC", "-shared", "f.c", "-o", str(library), "-lm"]
     run_compiler(command, tmp_path)
