@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 JOBS ?= 2
 
-.PHONY: help demo test coverage wheel test-wheel lowest lint types docs bench study-impacts study-elastic study-global study-feasible study-flow study-robustness study-real-impacts study-verdict study-scan study-controller study-sweep reproduction calibration regression
+.PHONY: help demo test coverage wheel test-wheel lowest lint types docs bench bench-gpu study-impacts study-elastic study-global study-feasible study-flow study-robustness study-real-impacts study-verdict study-scan study-controller study-sweep reproduction calibration regression
 .PHONY: pictures viewer clean
 
 help:
@@ -16,6 +16,7 @@ help:
 	@echo "make test-wheel  the steps of `make wheel`, then all tests with the installed wheel"
 	@echo "make lowest      the steps of `make test-wheel` with the lowest versions that pyproject.toml allows; PYTHON= selects the Python"
 	@echo "make bench       measure solve times, ticks, and the exported kernel against other implementations"
+	@echo "make bench-gpu   measure the CUDA export on this GPU, beside all cores, PyTorch and frax (three minutes)"
 	@echo "make coverage    measure the branch coverage of both packages by the tests, for the documentation"
 	@echo "make study-impacts  compare predictions of the objectives with impacts simulated in MuJoCo"
 	@echo "make study-elastic  compare the predicted inertia of arms with elastic joints with MuJoCo"
@@ -93,6 +94,9 @@ docs: $(VENV)/.installed-docs
 
 bench: $(VENV)/.installed-test
 	$(BIN)/python -m docs.studies solve loader tsid kernel
+
+bench-gpu: $(VENV)/.installed-test
+	$(BIN)/python -m docs.studies gpu
 
 coverage: $(VENV)/.installed-test
 	$(BIN)/python -m tests.support.coverage_report -n $(JOBS) --dist worksteal

@@ -32,11 +32,9 @@ _SPILL = 2
 # while the block computes one group of configurations after the other.
 _BATCH_BLOCK = 60
 
-# Largest number of operations of a CUDA function whose blocks are inlined, so that its values can be in registers.  With
-# longer functions, the compiler stores more values in memory than separate blocks do.
+# Largest number of operations of a CUDA function whose blocks are inlined, so that its values can be in registers.
+# The compiler stores more values of a longer function in memory than its separate blocks store.
 _INLINED = 6000
-# Largest size of a table in the constant memory of a GPU, bytes.  The memory has 64 KiB.
-_CONSTANT_MEMORY = 60_000
 
 
 @dataclass(frozen=True)

@@ -160,7 +160,9 @@ def _context(
         "block": _CUDA_BLOCK,
         "signatures": SIGNATURES,
         "sizes": sizes,
-        "kernels": [(Verbatim(v.stem), name) for v in exported for name in (("objective",) if v.joint else SIGNATURES)],
+        "kernels": [
+            (Verbatim(v.stem), name) for v in exported for name in (("objective",) if v.joint else SIGNATURES)
+        ],
         "parameters": _verbatim(partial(_parameters, real, sizes)),
         "reals": _verbatim(real.initializer),
         "literals": _verbatim(lambda values: ", ".join(map(real.literal, values))),

@@ -14,7 +14,7 @@ import pytest
 from impact_posture.codegen.c_literals import DOUBLE, FLOAT, Real
 from impact_posture.codegen.compile_and_check import deviation, largest_difference
 from impact_posture.codegen.export import Export, export, write_export
-from impact_posture.codegen.export_functions import SIGNATURES, lengths
+from impact_posture.codegen.export_functions import SIGNATURES
 from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.codegen.self_test import casadi_reference, sample_postures, self_test_tolerance
 from impact_posture.errors import InputError
@@ -28,7 +28,8 @@ from tests.support.tools import STRICT, cxx_compiler, need, need_compiler
 
 OPTIMIZED = True
 
-# The words of CUDA that a C++ compiler does not know.  The program sets the index of a thread before it calls a kernel.
+# The words of CUDA that a C++ compiler does not know.  The program sets the index of a thread before it calls a
+# kernel.
 WORDS = """
 #include <cmath>
 #include <cstddef>
@@ -38,7 +39,7 @@ WORDS = """
 #define __noinline__
 #define __forceinline__ inline
 #define __launch_bounds__(threads)
-static struct { size_t x; } blockIdx, threadIdx;
+static struct { size_t x; } blockIdx, threadIdx, gridDim;
 using std::isfinite;
 inline void sincosf_(float angle, float *sine, float *cosine) { *sine = sinf(angle); *cosine = cosf(angle); }
 #define sincosf sincosf_
@@ -51,7 +52,6 @@ def on_host(written: Export, objectives: list[WorstCaseObjective]) -> ctypes.CDL
     if compiler is None:
         pytest.skip("no C++ compiler")
     prefix, real = written.prefix, written.manifest["real"]
-    sizes = lengths(written.manifest["nq"], written.manifest["nv"])
     lines = [WORDS, "namespace device {", f'#include "{written.out / prefix}.cuh"', "}", 'extern "C" {']
     for symbol in written.functions:
         stem, _, name = symbol.rpartition("_")
@@ -63,24 +63,26 @@ def on_host(written: Export, objectives: list[WorstCaseObjective]) -> ctypes.CDL
         lines.append(f"""
 int {symbol}(const {real} *q, const {real} *n, int count, {real} *H, {real} *grad)
 {{
-  // One more thread than rows, which must not write anything.
-  for (int row = 0; row <= count; ++row) {{
-    blockIdx.x = row / 32;
-    threadIdx.x = row % 32;
-    device::{stem}_kernel<32>(q, n, count, count, H, grad, nullptr);
-  }}
+  // One block of one thread computes all rows.
+  blockIdx.x = threadIdx.x = 0;
+  gridDim.x = 1;
+  device::{stem}_kernel<1>(q, n, count, count, H, grad, nullptr);
   return 0;
 }}
 void {stem}_rows(const {real} *q, const {real} *n, int count, {real} *H, {real} *grad, int *status)
 {{
-  blockIdx.x = 0;
-  for (threadIdx.x = 0; threadIdx.x < (size_t)count; ++threadIdx.x) {{
-    device::{stem}_kernel<>(q, n, 1, count, H, grad, status);
+  // More threads than rows; the last threads must not write anything.
+  gridDim.x = 2;
+  for (blockIdx.x = 0; blockIdx.x < 2; ++blockIdx.x) {{
+    for (threadIdx.x = 0; threadIdx.x < 2; ++threadIdx.x) {{
+      device::{stem}_kernel<2>(q, n, 1, count, H, grad, status);
+    }}
   }}
 }}""")
-    assert sizes["n"] == 3
     (written.out / "host.cpp").write_text("\n".join([*lines, "}"]))
-    run_compiler([*compiler, "-std=c++17", "-O1", *STRICT, "-fPIC", "-shared", "host.cpp", "-o", "host.so"], written.out)
+    run_compiler(
+        [*compiler, "-std=c++17", "-O1", *STRICT, "-fPIC", "-shared", "host.cpp", "-o", "host.so"], written.out
+    )
     return ctypes.CDLL(str(written.out / "host.so"))
 
 
@@ -109,7 +111,9 @@ def test_equals_the_c_export(case: str, tmp_path: Path) -> None:
     robot = load_robot(name)
     supports = robot.spec.supports if "feet" in case else ()
     objectives = [
-        WorstCaseObjective(robot, ImpactContact(frame, (1.0, 0.3, -0.2), (0.01, 0.02, 0.0)), supports=supports, **options)
+        WorstCaseObjective(
+            robot, ImpactContact(frame, (1.0, 0.3, -0.2), (0.01, 0.02, 0.0)), supports=supports, **options
+        )
         for frame in frames
     ]
     written = export(objectives, tmp_path, prefix="gpu", real=real, cuda=True, check=False)
@@ -127,7 +131,9 @@ def test_equals_the_c_export(case: str, tmp_path: Path) -> None:
                 assert code == expected_code == 0
                 for result, value in zip(results, expected, strict=True):
                     assert deviation(result.astype(float), value.astype(float)).error <= tolerance, (case, function)
-    assert largest_difference(device[0], objectives[0], casadi_reference, 3) <= self_test_tolerance(objectives[0], real)
+    assert largest_difference(device[0], objectives[0], casadi_reference, 3) <= self_test_tolerance(
+        objectives[0], real
+    )
 
 
 def test_several_contacts(tmp_path: Path) -> None:

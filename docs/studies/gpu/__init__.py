@@ -1,0 +1,1 @@
+"""H and ∇H on a GPU, beside the same functions on all cores and other packages."""

@@ -1,0 +1,158 @@
+"""Build and time the cases that ``prepare.py`` wrote: ``run.py [--build ARCHITECTURE] [--only TEXT]``.
+
+This program needs nvcc, gcc and Python without packages.  It runs in a folder that ``prepare.py`` wrote, also on a
+machine without impact-posture.  ``--build sm_90`` only builds the programs of the GPU, on a machine without a GPU.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).resolve().parent
+Case = dict[str, Any]
+
+
+def run(line: list[str], seconds: int = 120) -> str:
+    """Run a program in this folder; return its last line, or a JSON object with the error."""
+    environment = os.environ | {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
+    try:
+        done = subprocess.run(
+            line, cwd=HERE, env=environment, capture_output=True, text=True, timeout=seconds, check=False
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return json.dumps({"error": str(error)[:200]})
+    if done.returncode == 0:
+        return (done.stdout.splitlines() or [""])[-1]
+    if done.stdout.startswith("{"):
+        return done.stdout
+    return json.dumps({"error": (done.stderr.strip().splitlines() or ["failed"])[-1][:200]})
+
+
+def program(case: Case) -> str:
+    """Return the name of the program that times a case."""
+    return f"{case['name']}-{case['real']}-{case['threads']}".replace(" ", "_")
+
+
+def build_gpu(case: Case, architecture: str) -> str:
+    """Compile the kernel of a case, unless its program is there; return an error or an empty text."""
+    if (HERE / program(case)).is_file():
+        return ""
+    defined = {
+        "HEADER": f'"{case["header"]}"', "KERNEL": f"{case['prefix']}_eval_kernel", "REAL": case["real"],
+        "THREADS": case["threads"],
+    }  # fmt: skip
+    line = ["nvcc", "-std=c++17", "-O3", f"-arch={architecture}", *[f"-D{k}={v}" for k, v in defined.items()]]
+    answer = run([*line, *case.get("flags", []), "bench.cu", "-o", program(case)], 300)
+    return answer if answer.startswith("{") else ""
+
+
+def build_cores(case: Case) -> str:
+    """Compile the C export of a case for this processor; return an error or an empty text."""
+    source = Path(case["header"]).with_suffix(".c")
+    defined = [f'-DHEADER="{source.with_suffix(".h")}"', f"-DBATCH={case['prefix']}_eval_batch"]
+    line = ["gcc", "-std=gnu99", "-O3", "-march=native", "-fopenmp", "-ffp-contract=fast", *defined]
+    answer = run([*line, "cores.c", str(source), "-o", f"cores-{case['name']}", "-lm"], 300)
+    return answer if answer.startswith("{") else ""
+
+
+def times(cases: list[Case]) -> Iterator[list[str]]:
+    """Yield a row for each case and each number of blocks per multiprocessor."""
+    for case in cases:
+        for blocks in case.get("blocks", [0]):
+            got = json.loads(run([f"./{program(case)}", case["samples"], str(case["rows"]), str(blocks)]))
+            if "error" in got:
+                yield [case["name"], case["real"], f"{case['threads']}", got["error"]]
+                continue
+            yield [
+                case["name"], case["real"], f"{case['threads']}", f"{got['threads']}", f"{got['million']:,.0f}",
+                f"{got['best']:,.0f}", f"{got['error_H']:.0e}", f"{got['error_grad']:.0e}", f"{got['registers']}",
+                f"{got['local']}", f"{got['call_us']:.1f}", f"{got['launch_us']:.1f}",
+            ]  # fmt: skip
+
+
+def table(head: str, rows: Iterator[list[str]]) -> None:
+    """Print a Markdown table, row by row."""
+    names = head.split("|")
+    print("", f"| {' | '.join(names)} |", "|" + "---|" * len(names), sep="\n", flush=True)
+    for row in rows:
+        print(f"| {' | '.join(row)} |", flush=True)
+
+
+def cores(cases: list[Case]) -> Iterator[list[str]]:
+    """Yield the evaluations per second of the C export on all cores of this machine."""
+    for case in cases:
+        got = json.loads(build_cores(case) or run([f"./cores-{case['name']}", case["samples"]]))
+        yield [
+            case["name"],
+            *(
+                [got["error"]]
+                if "error" in got
+                else [str(got["cores"]), f"{got['million']:.1f}", f"{got['error_H']:.0e}"]
+            ),
+        ]
+
+
+def frameworks(cases: list[Case]) -> Iterator[list[str]]:
+    """Yield the times of calls from PyTorch."""
+    for case in cases:
+        got = json.loads(run([sys.executable, "framework_peer.py", json.dumps(case)]))
+        if "error" in got:
+            yield [case["name"], case["real"], got["error"]]
+            continue
+        adam = f"{got['adam_s']:.2f} s, {got['before']:.3g} to {got['after']:.3g}" if "adam_s" in got else "–"
+        yield [case["name"], case["real"], f"{got['nvrtc_s']:.1f}", *[f"{us:.0f}" for us in got["us"]], adam]
+
+
+def frax(cases: list[Case]) -> Iterator[list[str]]:
+    """Yield the evaluations per second of frax."""
+    for case in cases:
+        for real in ("double", "float"):
+            got = json.loads(
+                run([sys.executable, "frax_peer.py", case["urdf"], case["root"], real, str(case["rows"] // 8)])
+            )
+            row = (
+                [got["error"]]
+                if "error" in got
+                else [f"{got['million']:.2f}", f"{got['compile_s']:.1f}", got["device"]]
+            )
+            yield [case["name"], real, *row]
+
+
+def main() -> int:
+    """Build and run all cases."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--build", default="", metavar="ARCHITECTURE")
+    parser.add_argument("--only", default="", metavar="TEXT")
+    asked = parser.parse_args()
+    began = time.monotonic()
+    cases = [c for c in json.loads((HERE / "cases.json").read_text(encoding="utf-8")) if asked.only in c["name"]]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for case, error in zip(cases, pool.map(lambda c: build_gpu(c, asked.build or "native"), cases), strict=True):
+            if error:
+                print(f"{program(case)}: {error}")
+    if asked.build:
+        return 0
+    name = run(["nvidia-smi", "--query-gpu=name,driver_version", "--format=csv,noheader"])
+    print(f"{name}; {run(['nvcc', '--version'])}; {os.cpu_count()} cores; built in {time.monotonic() - began:.0f} s")
+    head = "robot|type|threads|resident|million/s|best|error H|error ∇H|registers|local B|call µs|launch µs"
+    table(head, times(cases))
+    main_cases = [c for c in cases if not c.get("variant")]
+    double = [c for c in main_cases if c["real"] == "double"]
+    table("robot|cores|million/s|error H", cores(double))
+    table("robot|type|NVRTC s|1 row µs|4,096 rows|65,536 rows|300 Adam steps of 65,536", frameworks(main_cases))
+    table("frax|type|million/s|compile s|device", frax([c for c in double if c.get("frax")]))
+    print(f"\n{time.monotonic() - began:.0f} s")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
