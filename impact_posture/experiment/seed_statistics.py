@@ -19,7 +19,7 @@ from impact_posture.simulation.outcome import Outcome, gravest
 _OTHERS = ("stops", "contacts", "contacts_asked", "rested", "joint")
 QUANTITIES = (*(f.name for f in fields(Metrics) if f.name not in _OTHERS), "joint_velocity", "joint_share")
 
-# Confidence of the intervals.
+# Confidence level of the intervals.
 CONFIDENCE = 0.95
 # An interval is shown only for at least this number of samples.  For two samples, the quantile of Student's t is
 # 12.7, so the interval is too wide to be useful.
@@ -30,7 +30,7 @@ _SAME = 1e-12
 
 @dataclass(frozen=True)
 class Interval:
-    """Mean with its interval of the confidence :data:`CONFIDENCE` (Student's t).
+    """Mean with its confidence interval (Student's t) of the level :data:`CONFIDENCE`.
 
     Attributes:
         mean: Mean of the samples.
@@ -63,7 +63,7 @@ class Interval:
 
 
 def statistic(seeds: int, intervals: Sequence[Interval]) -> str:
-    """Return in words what the numbers with these intervals, over ``seeds`` seeds, are."""
+    """Describe the numbers of a table in words: means over ``seeds`` seeds, with their ``intervals``."""
     if seeds == 1:
         return "one seed, so there are no intervals"
     means = f"means of {seeds} seeds"
