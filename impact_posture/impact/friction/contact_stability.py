@@ -12,9 +12,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 
 from impact_posture.config.json_block import JsonBlock
+from impact_posture.dynamics.linear_program import solve_linear
 from impact_posture.impact.quantities.impact_oracle import ImpactOracle
 from impact_posture.robot.robot_spec import Support
 from impact_posture.system.arrays import Array
@@ -165,11 +165,8 @@ class FrictionCones:
         if not count:
             return particular
         # min t: -f_z ≤ t, t ≥ 0.
-        cost = np.concatenate([np.zeros(count), [1.0]])
-        A = np.hstack([up @ basis, -np.ones((len(up), 1))])
-        bounds = [(None, None)] * count + [(0.0, None)]
-        solution = scipy.optimize.linprog(cost, A_ub=A, b_ub=-up @ particular, bounds=bounds)
-        return particular if solution.status != 0 else particular + basis @ solution.x[:-1]
+        z = _least_last(np.hstack([up @ basis, -np.ones((len(up), 1))]), -up @ particular, 0.0)
+        return particular if z is None else particular + basis @ z
 
     def within(self, particular: Array, basis: Array, friction: float) -> Array | None:
         """Return the smallest possible impulses within the cones (maximum norm); ``None`` if there are none."""
@@ -177,13 +174,11 @@ class FrictionCones:
         slack = 1e-9 * max(float(np.abs(particular).max(initial=0.0)), 1e-300)
         if not basis.shape[1]:
             return particular if (A @ particular <= _NONE * np.abs(particular).max(initial=1e-300)).all() else None
-        size = basis.shape[1]
-        cost = np.concatenate([np.zeros(size), [1.0]])
         limits = np.vstack([np.hstack([sign * basis, -np.ones((len(particular), 1))]) for sign in (1.0, -1.0)])
         rows = np.vstack([np.hstack([A @ basis, np.zeros((len(A), 1))]), limits])
         right = np.concatenate([slack - A @ particular, -particular, particular])
-        solution = scipy.optimize.linprog(cost, A_ub=rows, b_ub=right, bounds=[(None, None)] * (size + 1))
-        return particular + basis @ solution.x[:-1] if solution.status == 0 else None
+        z = _least_last(rows, right, -np.inf)
+        return None if z is None else particular + basis @ z
 
     def feet(self, impulse: Array, none: float) -> tuple[FootImpulse, ...]:
         """Return the impulse on each foot.  A foot lifts if its pull is above ``none``."""
@@ -195,3 +190,11 @@ class FrictionCones:
                 FootImpulse(support.frame, foot_impulse[:3].copy(), moment.copy(), bool(foot_impulse[2] < -none))
             )
         return tuple(feet)
+
+
+def _least_last(A: Array, b: Array, least: float) -> Array | None:
+    """Return the ``z`` for which ``A [z; t] ≤ b`` with the smallest ``t ≥ least``; ``None`` if there is none."""
+    count, free = A.shape[1] - 1, np.full(A.shape[1] - 1, np.inf)
+    cost, low, high = np.append(np.zeros(count), 1.0), np.append(-free, least), np.append(free, np.inf)
+    optimum = solve_linear(cost, A, np.full(len(b), -np.inf), b, low, high)
+    return None if optimum is None else optimum.x[:-1]

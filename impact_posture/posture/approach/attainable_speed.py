@@ -15,13 +15,13 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from impact_posture.dynamics.linear_program import solve_linear
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import PointOnLink, Tree
 from impact_posture.impact.impact_contact import point_on
 from impact_posture.impact.objective import Objective
 from impact_posture.posture.constraints.requirements import Requirements
 from impact_posture.posture.program.constrained_problem import RANK_TOLERANCE, held_rows
-from impact_posture.posture.program.linear_program import solve_linear
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array, independent_rows
 

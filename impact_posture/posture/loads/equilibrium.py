@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import pinocchio as pin
 
+from impact_posture.dynamics.linear_program import solve_linear
 from impact_posture.posture.loads.static_load import ForceSource, StaticLoad
-from impact_posture.posture.program.linear_program import solve_linear
 from impact_posture.robot.model_joints import effort_unit
 from impact_posture.system.arrays import Array
 
