@@ -114,8 +114,8 @@ def export_library(exported: Sequence[NamedObjective]) -> ExportLibrary:
     ``H`` and ``G``.
     """
     robot = exported[0].objective.robot
-    model, coupled = robot.model, {joint for c in robot.couplings for joint in (c.follower, c.leader)}
-    q, n, limbs = ca.SX.sym("q", model.nq), ca.SX.sym("n", 3), RepeatedLimbs(model, coupled)
+    model, q, n = robot.model, ca.SX.sym("q", robot.nq), ca.SX.sym("n", 3)
+    limbs = RepeatedLimbs(model, robot.coupled_joints)
     outputs: dict[str, ca.SX] = {}
     functions: list[Exported] = []
     for number, v in enumerate(exported):

@@ -137,7 +137,7 @@ class PathSpace:
         """Return ``target`` with revolute joints moved by full turns towards ``start``, within their limits."""
         target = target.copy()
         for slot in self.projector.chart.slots:
-            if slot.kind.family == "revolute":
+            if slot.kind.family == "revolute" and slot.name not in self.problem.robot.coupled_joints:
                 turns = np.round((target[slot.q] - start[slot.q]) / (2 * np.pi))
                 nearer = target[slot.q] - 2 * np.pi * turns
                 if ((self.problem.lower[slot.x] <= nearer) & (nearer <= self.problem.upper[slot.x])).all():

@@ -149,13 +149,14 @@ def couple_limits(model: pin.Model, couplings: Iterable[JointCoupling]) -> list[
             limit = fast[f] / abs(c.ratio)
             fast[lead] = min(fast[lead], limit) if fast[lead] > 0 else limit
             slow[lead] = -fast[lead]
-    for c in couplings:
-        f, lead = _in_q(model, c.follower), _in_q(model, c.leader)
-        with np.errstate(over="ignore"):  # Pinocchio writes "no limit" as the largest double.
+    # Pinocchio writes "no limit" as the largest double, so a product may overflow to infinity.
+    with np.errstate(over="ignore"):
+        for c in couplings:
+            f, lead = _in_q(model, c.follower), _in_q(model, c.leader)
             low[f], high[f] = sorted(c.ratio * bound + c.offset for bound in (low[lead], high[lead]))
-        f, lead = _in_v(model, c.follower), _in_v(model, c.leader)
-        fast[f] = abs(c.ratio) * fast[lead]
-        slow[f] = -fast[f]
+            f, lead = _in_v(model, c.follower), _in_v(model, c.leader)
+            fast[f] = abs(c.ratio) * fast[lead]
+            slow[f] = -fast[f]
     model.lowerPositionLimit, model.upperPositionLimit = low, high
     model.lowerVelocityLimit, model.upperVelocityLimit = slow, fast
     return warnings

@@ -163,6 +163,11 @@ class Robot:
         return coupled_entries(self.model, self.couplings)
 
     @cached_property
+    def coupled_joints(self) -> frozenset[str]:
+        """Names of all leaders and followers."""
+        return frozenset(joint for c in self.couplings for joint in (c.leader, c.follower))
+
+    @cached_property
     def projector(self) -> Array:
         """Projector onto the velocities that an impact can change: coupled, and zero at locked joints, (nv, nv)."""
         return np.asarray(self.coupling_matrix * np.isfinite(self.model.armature))

@@ -13,6 +13,7 @@ from impact_posture.codegen.export import export
 from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.dynamics.mjcf import build_mjcf
 from impact_posture.errors import InputError, PostureError, UrdfError
+from impact_posture.impact.evaluation.evaluation import evaluate
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.impact.metric import Metric
@@ -109,6 +110,9 @@ def test_gradients_and_the_exported_code_agree(tmp_path: Path, kind: str, metric
     assert_close(np.array(gradient).ravel(), objective.gradient(q), 1e-9, "CasADi and Pinocchio")
     differences = central_gradient(objective.value, loaded.model, q, 2e-4)
     assert_close(objective.gradient(q), differences, 1e-8, "differences")
+    together = evaluate(objective, q).gradient
+    ends = [objective.oracle.quantities(loaded.coupled(q + step * np.eye(5)[2])).H for step in (-1e-5, 1e-5)]
+    assert together[2] == pytest.approx((ends[1] - ends[0]) / 2e-5, rel=1e-6) and not together[3:].any()
     if kind == "impulse" and metric.kind == "euclidean":
         (tmp_path / "code").mkdir()
         made = export(objective, tmp_path / "code", prefix="grip", check=False)

@@ -57,8 +57,9 @@ class Evaluation(JsonBlock):
         scalars: H, G, V, S and E, computed with the supports; also attributes of the evaluation.
         objective: Value of the objective; for ``impulse`` with the factor λ̄², where λ̄ is the largest impulse of the
             contact.  ``None`` if it does not exist at ``q``.
-        gradient: Tangent gradient of H, shape (nv,).
-        objective_gradient: Tangent gradient of the objective, shape (nv,); ``None`` if it does not exist at ``q``.
+        gradient: Tangent gradient of H, shape (nv,).  The entries of a leader also count the motion of its followers,
+            whose entries are zero.
+        objective_gradient: Likewise of the objective; ``None`` if it does not exist at ``q``.
         normal: Unit normal for which H, G, V, S, E and the jumps are computed, world axes, shape (3,).
         worst_normal: Unit normal for which the objective is computed, world axes, shape (3,).  With a cone of
             normals, the worst normal of the cone; otherwise equal to ``normal``.
@@ -201,6 +202,7 @@ def evaluate(
     model_variants = variant_values(objective, q)
     member = objective.by_variant[worst_variant(model_variants)] if model_variants else objective
     value = objective_value(member, q)
+    C, slope = objective.robot.coupling_matrix, objective_gradient(member, q, value)
     cone = _worst(member, q)
     singles = objective.singles if objective.others else ()
     squeezed = compression(objective, q, speed, contact_stiffness)
@@ -208,8 +210,8 @@ def evaluate(
         q=np.array(q, dtype=float),
         scalars=scalars,
         objective=value,
-        gradient=oracle.gradient_H(q),
-        objective_gradient=objective_gradient(member, q, value),
+        gradient=C.T @ oracle.gradient_H(q),
+        objective_gradient=None if slope is None else C.T @ slope,
         normal=quantities.normal,
         worst_normal=quantities.normal if cone is None else cone.normal,
         cone=cone,

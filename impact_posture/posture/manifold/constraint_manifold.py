@@ -77,7 +77,8 @@ class ConstraintManifold:
         self._turning = np.zeros(self.chart.nx, dtype=bool)
         self.lower, self.upper = problem.lower.copy(), problem.upper.copy()
         for slot in self.chart.slots:
-            if slot.kind.family in ("revolute", "continuous"):
+            # A full turn of a coupled joint moves its partners.
+            if slot.kind.family in ("revolute", "continuous") and slot.name not in problem.robot.coupled_joints:
                 k = slot.x.start
                 self._turning[k] = self.upper[k] - self.lower[k] >= 2 * np.pi
         limited = np.isfinite(self.lower) & np.isfinite(self.upper)
