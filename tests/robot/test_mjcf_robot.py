@@ -230,6 +230,9 @@ _TENDON = '<fixed name="cord"{}><joint joint="shoulder" coef="1"/><joint joint="
         ("<mujocoinclude><worldbody><body/></worldbody></mujocoinclude>", "name the file that includes"),
         ('<mujoco><worldbody><body><geom size="1"/></body></worldbody></mujoco>', "has no movable joint"),
         ("<mujoco><nothing/></mujoco>", "MuJoCo refuses it"),
+        ('<mujoco><include file="robot.xml"/></mujoco>', "'robot.xml' already included"),
+        (ARM.replace('mass=".4"', 'mass="1e308"').replace('size=".05 .04 .03"', 'size="1e9 1 1"'), "has an infinite"),
+        (ARM.replace('contype="0"', 'contype="zero"'), "MuJoCo refuses it"),
         ("<mujoco><worldbody>", "MuJoCo refuses it"),
     ],
 )  # fmt: skip

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 import tomllib
 from pathlib import Path
@@ -33,7 +34,7 @@ ARM = """<robot name="arm" xmlns:xacro="http://www.ros.org/wiki/xacro">
   <xacro:arg name="hand" default="false"/>
   <xacro:include filename="$(find arm_description)/link.xacro"/>
   <link name="base"/>
-  <xacro:link_of name="one" parent="base" mass="$(arg mass)" mesh="meshes/s.stl"/>
+  <xacro:link_of name="one" parent="base" mass="$(arg mass)" mesh="below/s.stl"/>
   <xacro:if value="$(arg hand)">
     <xacro:link_of name="hand" parent="one" mass="${0.5 * 2}" mesh="package://arm_description/meshes/s.stl"/>
   </xacro:if>
@@ -54,7 +55,7 @@ LINK = """<robot xmlns:xacro="http://www.ros.org/wiki/xacro">
 @pytest.fixture
 def arm(tmp_path: Path) -> str:
     files = {"urdf/arm.urdf.xacro": ARM, "link.xacro": LINK}
-    files |= dict.fromkeys(("meshes/s.stl", "urdf/meshes/s.stl"), TETRAHEDRON)
+    files |= dict.fromkeys(("meshes/s.stl", "urdf/below/s.stl"), TETRAHEDRON)
     for name, text in files.items():
         path = tmp_path / "arm_description" / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -69,6 +70,8 @@ def test_defaults_and_arguments(arm: str) -> None:
     assert np.allclose(handed.velocity_limits, np.pi)
     shapes = read_shapes(handed)
     assert [shape.link for shape in shapes.shapes] == ["one", "hand"] and not shapes.warnings
+    shutil.move(Path(arm).parent / "below", Path(arm).parents[1])
+    assert not read_shapes(load_robot(arm)).warnings
 
 
 def test_robot_toml_beside_the_xacro_file_is_read(arm: str) -> None:
@@ -88,6 +91,7 @@ def test_command_line_and_problem_file(arm: str, tmp_path: Path) -> None:
     [
         ("${0.5 * 2}", "${0.5 * lost}", "name 'lost' is not defined"),
         ("</robot>", "", "cannot be expanded"),
+        (ARM[ARM.index("  <link") :], "</robot>", "without links; name the file that uses its macros"),
         (
             "$(find arm_description)",
             "$(find arm_descriptoin)",
