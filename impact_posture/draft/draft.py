@@ -172,7 +172,7 @@ def _model(draft: Draft, robot: Robot, options: LoadOptions, folder: Path) -> No
 def _contact(draft: Draft, robot: Robot, feet: Sequence[str], ends: Sequence[str]) -> Sequence[str]:
     """Add the table ``[contact]`` to the draft; return the joints that move the contact frame."""
     base, fingers = guess.base_frame(robot), guess.fingers(robot)
-    legs = {joint for foot in feet for joint in guess.joints_to(robot, foot)}
+    legs = {joint for end in (*feet, *guess.propellers(robot)) for joint in guess.joints_to(robot, end)}
     arms: list[str] = []
     for frame in (*ends, *guess.tips(robot, feet)):
         joints = guess.joints_to(robot, frame) if frame in robot.frame_names else []

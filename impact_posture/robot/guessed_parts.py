@@ -137,9 +137,9 @@ def fingers(robot: Robot) -> tuple[str, ...]:
 
 
 def base_frame(robot: Robot) -> str:
-    """Return the name of the root link."""
-    joint = 1 if robot.floating else 0
-    return str(next(f.name for f in robot.model.frames if f.parentJoint == joint and f.type == pin.FrameType.BODY))
+    """Return the name of the root link, or of the first link if an MJCF fixes no link to the world."""
+    links = [frame for frame in robot.model.frames if frame.type == pin.FrameType.BODY and frame.name != "universe"]
+    return str(min(links, key=lambda frame: frame.parentJoint).name)
 
 
 def wheels(robot: Robot) -> tuple[str, ...]:

@@ -17,9 +17,12 @@ from impact_posture.config.problem_settings import LoadOptions
 from impact_posture.draft.draft import write_draft
 from impact_posture.draft.toml_lines import Draft
 from impact_posture.errors import InputError, OutputError, UrdfError
+from impact_posture.impact.impact_case import ImpactCase
+from impact_posture.impact.impact_contact import ImpactContact
+from impact_posture.impact.quantities.impact_oracle import ImpactOracle
 from impact_posture.posture.formulation.problem_file import prepare
 from impact_posture.posture.search.multistart import solve
-from impact_posture.robot.actuation import hover
+from impact_posture.robot.actuation import hover, torque_limits
 from impact_posture.robot.guessed_parts import feet, tips
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.robot.robot_spec import RobotSpec, read_spec
@@ -194,6 +197,7 @@ def test_propellers_are_drafted_as_a_commented_table(turning: bool, tmp_path: Pa
     out.write_text(uncommented(draft.text))
     loaded, by_hand = load_robot(str(tmp_path / "quad_arm.urdf")), read_spec(QUAD_ARM / "quad_arm.toml").propulsion
     assert loaded.root == "free-flyer" and loaded.joint_names == ("shoulder", "elbow")
+    assert loaded.spec.contact.frame == "tool"
     propulsion = loaded.spec.propulsion
     assert propulsion is not None and by_hand is not None
     assert propulsion.rotors == by_hand.rotors and propulsion.frame == by_hand.frame
@@ -203,6 +207,8 @@ def test_propellers_are_drafted_as_a_commented_table(turning: bool, tmp_path: Pa
 
 def test_a_multirotor_without_joints_is_drafted(tmp_path: Path) -> None:
     source = uri("iris_description/robots/iris_simple.urdf")
+    spinning, _ = write_draft(uri("iris_description/robots/iris.urdf"), LoadOptions(), tmp_path / "spinning.toml")
+    assert read_spec(spinning).contact.frame == "iris__base_link"
     out, draft = write_draft(source, LoadOptions(), tmp_path / "iris.toml")
     out.write_text(uncommented(draft.text))
     loaded = load_robot(source, LoadOptions(config=str(out)))
@@ -219,3 +225,17 @@ def test_rotors_of_motors_are_no_propellers(tmp_path: Path) -> None:
     _, draft = write_draft(uri("b1_description/urdf/b1.urdf"), LoadOptions(), tmp_path / "b1.toml")
     assert "FL_hip_rotor" in (example_robot_data() / "b1_description/urdf/b1.urdf").read_text()
     assert "propulsion" not in draft.text
+
+
+def test_the_example_is_the_same_arm_as_a_urdf_and_as_an_mjcf(tmp_path: Path) -> None:
+    """The MJCF states what the robot.toml adds to the URDF, and no link of the MJCF is fixed to the world."""
+    pytest.importorskip("mujoco")
+    xml, by_hand = (str(QUAD_ARM.parent / path) for path in ("rail_arm_mjcf/rail_arm.xml", "rail_arm/rail_arm.urdf"))
+    out, draft = write_draft(xml, LoadOptions(), tmp_path / "rail_arm.toml")
+    assert 'frame = "tool"' in draft.text and "[armature]" not in draft.text
+    arms = [load_robot(xml, config=str(out)), load_robot(by_hand)]
+    mjcf, urdf = (ImpactCase(arm, ImpactContact("tool", (-1.0, 0.0, 0.0))) for arm in arms)
+    assert np.allclose(arms[0].posture(), arms[1].posture()) and arms[0].joint_names == arms[1].joint_names
+    assert torque_limits(arms[0].model).tolist() == torque_limits(arms[1].model).tolist()
+    values = [ImpactOracle(case).quantities(case.robot.posture()).H for case in (mjcf, urdf)]
+    assert values[0] == pytest.approx(values[1], rel=1e-9)

@@ -74,7 +74,7 @@ class Holdable(Constraint):
         k = self._names.index(name)
         low, high, unit = self._rest.lower[k], self._rest.upper[k], self._rest.units[k]
         if low == -high:
-            return f"needs {high * (1 + violation):.4g} {unit}, limit {high:.4g} {unit}"
+            return f"needs {high * (1 + violation):.6g} {unit}, limit {high:.4g} {unit}"
         return f"{(high - low) / 2 * violation:.3g} {unit} outside {low:.4g} to {high:.4g} {unit}"
 
     def evaluate(self, model: Numeric) -> tuple[Array, Array]:
