@@ -51,7 +51,7 @@ def problem_of(case: Case) -> ConstrainedProblem:
     wanted = Requirements(
         contact_pose="free" if stands else "full",
         base="level" if robot.spec.kind == "aerial" else "free",
-        hold=tuple(j for j in robot.spec.constraints.hold if j not in robot.locked),
+        hold=robot.held,
         com_over_feet=stands,
         com_margin=options.com_margin if stands else 0.0,
         limit_margin=options.joint_margin,

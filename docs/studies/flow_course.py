@@ -84,9 +84,7 @@ class CompiledFlow:
         library = load_library(library_path(folder, "course"))
         self._begin, self._run = library.course_begin, library.course_run
         self._ranges, moving = JointRanges(robot), np.ones(robot.nv, dtype=bool)
-        moving[[robot.tangent_names.index(j) for j in robot.spec.constraints.hold if j in robot.tangent_names]] = (
-            False
-        )
+        moving[robot.held_entries] = False
         self._moving = np.flatnonzero(moving & np.isfinite(self._ranges.upper - self._ranges.lower))
 
     def share(self, q: Vector) -> float:

@@ -8,7 +8,6 @@ import numpy as np
 
 from docs.studies.core import Request, table
 from impact_posture.collision.contact_front import ContactFront, contact_front
-from impact_posture.impact.resolved_impact import held_by_default
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import known_robots, load_robot
 
@@ -35,7 +34,7 @@ def front(robot: Robot, frame: str, axis: str) -> ContactFront:
     """Return the front of a contact frame along an axis of the frame, such as ``-z``, from its contact point."""
     direction = np.eye(3)["xyz".index(axis[-1])] * (-1 if axis.startswith("-") else 1)
     offset = robot.spec.contact.offset_of(frame)
-    measured = contact_front(robot, robot.posture(), frame, offset, direction, held_by_default(robot))
+    measured = contact_front(robot, robot.posture(), frame, offset, direction, robot.held)
     assert measured is not None, f"{frame} of {robot.name} has no shapes"
     return measured
 

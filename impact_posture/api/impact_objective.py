@@ -26,7 +26,7 @@ from impact_posture.impact.contact_point import at_front
 from impact_posture.impact.evaluation.evaluation import Evaluation, evaluate
 from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.impact.metric import Metric, build_metric, check_weights
-from impact_posture.impact.resolved_impact import choose_objective, held_by_default, missing_support
+from impact_posture.impact.resolved_impact import choose_objective, missing_support
 from impact_posture.impact.support_compliance import check_compliance
 from impact_posture.impact.supports import refuse_held, refuse_rigid, resolve_supports
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
@@ -107,7 +107,7 @@ class ImpactObjective(WorstCaseObjective):
         leading, *more = (_with_offset(robot, each) for each in (*contacts, *others))
         if contact_point == "front":
             q = read_posture(robot, posture)
-            leading, *more = (at_front(robot, each, q, held_by_default(robot)) for each in (leading, *more))
+            leading, *more = (at_front(robot, each, q, robot.held) for each in (leading, *more))
         feet = _supports(robot, supports)
         for each in (leading, *more):
             refuse_held(robot, each, feet)

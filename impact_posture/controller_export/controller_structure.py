@@ -182,7 +182,7 @@ def _add_flow(
     tasks = [task for task in formulation.tasks if task is not posture]
     leads = [k >= strict and isinstance(task, CenterOfMass | BaseOrientation) for k, task in enumerate(tasks)]
     held = [task.size for task, leading in zip(tasks, leads, strict=True) if not leading]
-    fixed = [robot.tangent_names.index(j) for j in robot.spec.constraints.hold if j in robot.tangent_names]
+    fixed = robot.held_entries
     edges = max(4, 4 * sizes["CONTACTS"]) if sizes["CONTACTS"] else 0
     # The tilt of a floating base needs one additional row.
     placed = edges + int(robot.floating)

@@ -44,7 +44,7 @@ def resolve(settings: ImpactSettings, robot: Robot | None = None) -> ResolvedImp
     robot = with_joint_model(load_robot(settings.robot, settings) if robot is None else robot, settings.joint_model)
     q = read_posture(robot, settings.posture)
     hold = getattr(settings, "hold", None)
-    held = held_by_default(robot) if hold is None else tuple(hold)
+    held = robot.held if hold is None else tuple(hold)
     leading, *others = _contacts(settings, robot)
     if settings.contact_point == "front":
         if settings.offset is not None:
@@ -78,11 +78,6 @@ def resolve(settings: ImpactSettings, robot: Robot | None = None) -> ResolvedImp
     posture = settings.posture or robot.default_posture
     speed, restitution = settings.speed, settings.restitution
     return ResolvedImpact(objective, q, posture, speed, restitution, held_by, stiffness, choice, held)
-
-
-def held_by_default(robot: Robot) -> tuple[str, ...]:
-    """Return the joints that robot.toml holds at their values, without locked joints."""
-    return tuple(joint for joint in robot.spec.constraints.hold if joint not in robot.locked)
 
 
 def choose_objective(settings: ImpactSettings, *, several: bool) -> tuple[ObjectiveKind, str]:

@@ -29,7 +29,14 @@ from impact_posture.robot.joint_coupling import (
     with_partners,
 )
 from impact_posture.robot.model_hash import dynamics_hash, hash_of, kinematics_hash, rounded
-from impact_posture.robot.model_joints import JOINT_ENTRIES, immovable_joints, joint_family, joint_range, q_slice
+from impact_posture.robot.model_joints import (
+    JOINT_ENTRIES,
+    immovable_joints,
+    joint_family,
+    joint_range,
+    q_slice,
+    v_slice,
+)
 from impact_posture.robot.robot_spec import RobotSpec
 from impact_posture.system.arrays import Array
 
@@ -176,6 +183,16 @@ class Robot:
     def followers(self) -> NDArray[np.bool_]:
         """Whether each velocity entry belongs to a joint that follows another joint, shape (nv,)."""
         return np.asarray(np.diag(self.coupling_matrix) == 0)
+
+    @property
+    def held(self) -> tuple[str, ...]:
+        """Joints that robot.toml holds at their values, without locked joints."""
+        return tuple(joint for joint in self.spec.constraints.hold if joint not in self.locked)
+
+    @property
+    def held_entries(self) -> list[int]:
+        """Entries of the joints :attr:`held` in ν."""
+        return [k for joint in self.held for k in range(self.nv)[v_slice(self.model, self.joint_id(joint))]]
 
     def fixed_with(self, hold: Sequence[str]) -> tuple[str, ...]:
         """Return the joints that cannot move if the joints ``hold`` do not: also those with equal position limits."""

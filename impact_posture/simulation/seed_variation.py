@@ -63,10 +63,9 @@ def _scaled(scenario: Scenario, speed: float, friction: float) -> Scenario:
 def _start(setup: Setup, size: float, generator: np.random.Generator) -> Array:
     """Return a random start near ``setup.q``.  The base of a flying robot stays, and the feet of a standing robot."""
     robot, model = setup.robot, setup.robot.model
-    held = [robot.tangent_names.index(j) for j in robot.spec.constraints.hold if j in robot.tangent_names]
     for _ in range(_DRAWS):
         step = size * generator.uniform(-1, 1, robot.nv)
-        step[held] = 0.0
+        step[robot.held_entries] = 0.0
         step[: robot.first_joint] *= 0.0 if setup.scenario.control.footing is None else _BASE
         q = np.clip(pin.integrate(model, setup.q, step), model.lowerPositionLimit, model.upperPositionLimit)
         if setup.scenario.control.footing is None:
@@ -83,9 +82,8 @@ def stand(setup: Setup, q: Array) -> Array | None:
     The center of mass stays above the support polygon.
     """
     robot = setup.robot
-    hold = tuple(j for j in robot.spec.constraints.hold if j not in robot.locked)
     requirements = Requirements(
-        contact_pose="free", hold=hold, com_over_feet=True, com_margin=_COM_MARGIN, com_asked=False
+        contact_pose="free", hold=robot.held, com_over_feet=True, com_margin=_COM_MARGIN, com_asked=False
     )
     problem = build_problem(robot, scenario_objective(setup), setup.q, requirements)
     projected = Projector(problem).project(q)

@@ -35,7 +35,7 @@ class Actuators:
     """
 
     def __init__(self, robot: Robot) -> None:
-        held = robot.fixed_with([joint for joint in robot.spec.constraints.hold if joint not in robot.locked])
+        held = robot.fixed_with(robot.held)
         for c in robot.couplings:
             if c.follower not in held:
                 fault = f"the controller drives each joint by itself, but '{c.follower}' follows '{c.leader}'"

@@ -15,7 +15,7 @@ from impact_posture.errors import InputError, SpecError
 from impact_posture.impact.elasticity.contact_compression import ContactStiffness
 from impact_posture.impact.evaluation.velocity_jump import normal_jump
 from impact_posture.impact.objective import Objective
-from impact_posture.impact.resolved_impact import FLOATS, ResolvedImpact, held_by_default, resolve
+from impact_posture.impact.resolved_impact import FLOATS, ResolvedImpact, resolve
 from impact_posture.posture.approach.approach_speed import ApproachSpeed
 from impact_posture.posture.approach.attainable_speed import FASTEST
 from impact_posture.posture.constraints.center_of_mass_over_feet import CenterOfMassOverFeet
@@ -89,7 +89,7 @@ def prepare(settings: ProblemSettings, impact: ResolvedImpact | None = None) -> 
     demands = requirements(settings, impact.objective)
     impact = replace(impact, held=impact.robot.fixed_with(demands.hold))
     problem = build_problem(impact.robot, impact.objective, impact.q, demands)
-    released = [joint for joint in held_by_default(impact.robot) if joint not in problem.requirements.hold]
+    released = [joint for joint in impact.robot.held if joint not in problem.requirements.hold]
     if released:
         note = f"robot.toml also holds {', '.join(released)}; your `hold` replaces its list, so these joints are free"
         problem = replace(problem, notes=(note, *problem.notes))
@@ -125,7 +125,7 @@ def requirements(settings: ProblemSettings, objective: Objective) -> Requirement
         contact_pose=poses[0] if poses else "free",
         other_poses=tuple(poses[1:]),
         base=settings.base or base,
-        hold=held_by_default(robot) if settings.hold is None else settings.hold,
+        hold=robot.held if settings.hold is None else settings.hold,
         com_over_feet=com,
         com_asked=settings.com is not None,
         com_margin=spec.com_margin if settings.com_margin is None else settings.com_margin,

@@ -93,7 +93,7 @@ class ReferenceFlow:
         weighted = [t for t in formulation.weighted if t not in self.led]
         self._tasks = [task for level in formulation.levels for task in level] + weighted
         self._base, nv = actuators.base, robot.nv
-        fixed = [robot.tangent_names.index(j) for j in robot.spec.constraints.hold if j in robot.tangent_names]
+        fixed = robot.held_entries
         self._places, count = stacked_rows([c.size for c in self._contacts] + [t.size for t in self._tasks])
         self._J, self.error = np.zeros((count + len(fixed), nv)), np.zeros(count + len(fixed))
         self._J[np.arange(count, count + len(fixed)), fixed] = 1.0
