@@ -168,6 +168,10 @@ def _check_tree(model: Any, path: Path) -> None:
         raise MjcfError(fault, where=str(path), hint=f"remove the joints that hardly matter {_STATED}")
     if model.nflex:
         raise MjcfError("has flexible bodies", where=str(path), hint=f"remove the <flexcomp> {_STATED}")
+    heavy = np.flatnonzero(~np.isfinite(np.c_[model.body_mass, model.body_inertia]).all(axis=1))
+    if heavy.size:
+        fault = f"body '{object_name(model, 'body', int(heavy[0]))}' has an infinite mass or inertia"
+        raise MjcfError(fault, where=str(path), hint="correct the mass or the size of its geoms")
     free = np.flatnonzero(model.jnt_type == import_mujoco().mjtJoint.mjJNT_FREE)
     if free.size and (free.size > 1 or free[0]):
         other = object_name(model, "body", int(model.jnt_bodyid[free[-1]]))
@@ -230,6 +234,7 @@ def _left_out(model: Any) -> Iterator[str]:
     balls = (model.jnt_type == mujoco.mjtJoint.mjJNT_BALL) & (model.jnt_limited > 0)
     tendons = (model.tendon_stiffness > 0) | (model.tendon_limited > 0) | (model.tendon_damping > 0)
     counts = {
+        "armature of the free joint": np.count_nonzero(model.dof_armature[:6]) * is_floating(model),
         "damping": np.count_nonzero(model.dof_damping),
         "friction loss": np.count_nonzero(model.dof_frictionloss),
         "springs": np.count_nonzero(model.jnt_stiffness),

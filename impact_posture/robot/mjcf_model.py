@@ -111,7 +111,7 @@ def placement(position: Array, quaternion: Array) -> pin.SE3:
 def _inertia(mjcf: Any, b: int) -> pin.Inertia:
     at = placement(mjcf.body_ipos[b], mjcf.body_iquat[b])
     moments = at.rotation @ np.diag(mjcf.body_inertia[b]) @ at.rotation.T
-    return pin.Inertia(float(mjcf.body_mass[b]), at.translation, moments)
+    return pin.Inertia(float(mjcf.body_mass[b]), at.translation, (moments + moments.T) / 2)
 
 
 def _set_limits(model: pin.Model, mjcf: Any) -> None:

@@ -46,7 +46,8 @@ def expand_xacro(
 
     ``arguments`` replace the defaults of ``<xacro:arg>``.  A package in ``$(find PACKAGE)`` and in ``package://``
     paths is in ``packages``, or has this name in one of the ``folders`` or in a folder above the file, or is a
-    package of ROS.  Relative paths of meshes start from the folder of the xacro file.
+    package of ROS.  Relative paths of meshes start from the folder of the xacro file, or from
+    the folder above it, where expanded files often are.
 
     Raises:
         UrdfError: The file cannot be expanded.
@@ -95,8 +96,11 @@ def expand_xacro(
         close = nearest(unknown, values.known, 1)
         hint = f"did you mean {close[0]}?" if close else "it has no arguments"
         raise InputError(f"no argument '{unknown}'", where=str(path), hint=hint)
+    if root.find("link") is None:
+        hint = "name the file that uses its macros"
+        raise UrdfError("expands to a robot without links", where=str(path), hint=hint)
     for mesh in root.iter("mesh"):
-        mesh.set("filename", _absolute(mesh.get("filename", ""), path.absolute().parent, find))
+        mesh.set("filename", _absolute(mesh.get("filename", ""), path.absolute().parents[:2], find))
     content = ET.tostring(root)
     name = path.name.removesuffix(".xacro").removesuffix(".urdf") + ".urdf"
     urdf = cache_folder("xacro", hashlib.sha256(content).hexdigest()[:16]) / name
@@ -114,11 +118,12 @@ def _index(find: Callable[[str], str]) -> dict[str, ModuleType]:
     return {module.__name__: module for module in (parent, packages)}
 
 
-def _absolute(text: str, folder: Path, find: Callable[[str], str]) -> str:
+def _absolute(text: str, folders: Sequence[Path], find: Callable[[str], str]) -> str:
     """Return the path of a mesh as a ``file://`` URI; keep ``package://`` paths of packages that do not exist."""
     scheme, colon, rest = text.partition("://")
     if not colon:
-        return f"file://{quote(str(folder / text))}"
+        paths = [folder / text for folder in folders]
+        return f"file://{quote(str(next((path for path in paths if path.is_file()), paths[0])))}"
     package, _, inside = rest.partition("/")
     with suppress(PackageNotFound):
         if scheme == "package":
