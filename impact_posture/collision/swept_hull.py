@@ -172,11 +172,11 @@ class Fit(NamedTuple):
     radius: float
 
 
-def fit_hull(points: Array, tolerance: float = _TOLERANCE) -> Fit:
+def fit_hull(points: Array) -> Fit:
     """Fit a sphere-swept convex hull that contains points, shape (n, 3), m.
 
     Candidates are the corners of the convex hull of the points.  Each step adds the candidate farthest from the
-    fitted hull.  The steps end if all candidates are within ``tolerance`` (m) of the fitted hull, or if it has 40
+    fitted hull.  The steps end if all candidates are within :data:`_TOLERANCE` of the fitted hull, or if it has 40
     corners.  The sweep radius is the largest distance of a point from the fitted hull.
     """
     corners = hull_corners(points)
@@ -196,7 +196,7 @@ def fit_hull(points: Array, tolerance: float = _TOLERANCE) -> Fit:
             k = queue[0][1]
             seen.add(k)
             heapreplace(queue, (-distance_from_hull(candidates[k], hull), k))
-        if len(chosen) >= min(MOST_VERTICES, len(candidates)) or -queue[0][0] <= tolerance:
+        if len(chosen) >= min(MOST_VERTICES, len(candidates)) or -queue[0][0] <= _TOLERANCE:
             break
         chosen.append(queue[0][1])
     outside = _extreme(_outside(points, hull))

@@ -129,29 +129,25 @@ class Projector:
         return blocked
 
 
-def feasible_start(
-    problem: ConstrainedProblem,
-    index: int,
-    seed: int,
-    candidates: int = CANDIDATES,
-    around: Array | None = None,
-    projector: Projector | None = None,
-) -> Array | None:
+def feasible_start(problem: ConstrainedProblem, index: int, seed: int, candidates: int = CANDIDATES) -> Array | None:
     """Return the ``index``-th feasible start of a seed, or ``None`` if no attempt reached the constraints.
 
-    Start 0 is the given posture, projected onto the constraints.  Odd starts lie near the posture ``around``, by
-    default the given one.  Even starts lie anywhere within the limits.  Near starts reach the constraints more often;
-    far starts lead to other optima.  A start is the one of ``candidates`` projected postures that violates the other
-    constraints least.  ``projector`` may belong to the same problem with fewer parts in its program.
+    Start 0 is the given posture, projected onto the constraints.  Another start is the one of ``candidates`` postures
+    (:class:`StartDraw`) that violates the other constraints least.
     """
     if index == 0:
-        projection = (projector or Projector(problem)).project(problem.given)
+        projection = Projector(problem).project(problem.given)
         return projection.q if projection.violation <= FEASIBLE else None
-    return StartDraw(problem, index, seed, around, projector).choose(candidates)
+    return StartDraw(problem, index, seed).choose(candidates)
 
 
 class StartDraw:
-    """The random postures of one start, drawn when they are needed; see :func:`feasible_start`."""
+    """The random postures of one start, projected onto the constraints, and drawn when they are needed.
+
+    Odd starts lie near the posture ``around``, by default the given one.  Even starts lie anywhere within the limits.
+    Near starts reach the constraints more often; far starts lead to other optima.  ``projector`` may belong to the
+    same problem with fewer parts in its program.
+    """
 
     def __init__(
         self,
