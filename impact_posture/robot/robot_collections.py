@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping
-from contextlib import redirect_stderr, redirect_stdout
+from contextlib import redirect_stderr, redirect_stdout, suppress
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
 from impact_posture.errors import InputError, RobotNotFound
-from impact_posture.robot.urdf import EXAMPLE_PREFIX
+from impact_posture.robot.urdf import EXAMPLE_PREFIX, example_models
 from impact_posture.system.optional_package import import_extra
 from impact_posture.system.progress import tell
 
@@ -59,6 +59,16 @@ def ways_to_name() -> tuple[str, ...]:
         f"{_DESCRIPTIONS}<module>, such as {_DESCRIPTIONS}panda_description or {_DESCRIPTIONS}panda_mj_description; "
         f"the first use clones the git repository of the robot ({descriptions})",
     )
+
+
+def names_with(text: str) -> list[str]:
+    """Return the names of robots in the installed collections that contain a text."""
+    names = [EXAMPLE_PREFIX + path for path in example_models() if text.casefold() in Path(path).stem.casefold()]
+    with suppress(ImportError):
+        names += [_MENAGERIE + name for name in import_module("mujoco_menagerie").names() if text in name]
+    with suppress(ImportError):
+        names += [_DESCRIPTIONS + name for name in import_module("robot_descriptions").DESCRIPTIONS if text in name]
+    return names
 
 
 def collected(robot: str) -> CollectedRobot:

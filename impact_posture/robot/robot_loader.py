@@ -30,10 +30,10 @@ from impact_posture.robot.joint_coupling import couple_limits, coupled, present,
 from impact_posture.robot.model_joints import immovable_joints, joint_index, movable_joints, q_slice, v_slice
 from impact_posture.robot.named_postures import ignored_bases, named_postures
 from impact_posture.robot.robot import CompiledMjcf, Robot
-from impact_posture.robot.robot_collections import COLLECTIONS, CollectedRobot, collected
+from impact_posture.robot.robot_collections import COLLECTIONS, CollectedRobot, collected, names_with
 from impact_posture.robot.robot_description import read_description
 from impact_posture.robot.robot_spec import RobotSpec, read_spec
-from impact_posture.robot.urdf import EXAMPLE_PREFIX, example_models, resolve_path, robots_data
+from impact_posture.robot.urdf import EXAMPLE_PREFIX, resolve_path, robots_data
 from impact_posture.robot.xacro_file import expand_xacro
 from impact_posture.system.arrays import Array
 
@@ -178,8 +178,7 @@ def locate(robot: str, options: LoadOptions) -> Located:
     elif names_a_path(robot, Path()):
         files = CollectedRobot(Path(robot).expanduser())
     else:
-        similar = [EXAMPLE_PREFIX + p for p in example_models() if robot.casefold() in Path(p).stem.casefold()]
-        raise RobotNotFound(robot, [*known_robots(), *similar], hint="(or give a path to a URDF or MJCF)")
+        raise RobotNotFound(robot, [*known_robots(), *names_with(robot)], hint="(or give a path to a URDF or MJCF)")
     home = files.path.parent
     config = Path(options.config) if options.config else home / "robot.toml"
     if options.config or (os.path.isfile(config) and not robot.startswith(COLLECTIONS)):

@@ -92,6 +92,8 @@ def test_menagerie(packages: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().out == ""
     with pytest.raises(RobotNotFound, match="no robot 'some_dgo'; did you mean some_dog"):
         load_robot("menagerie:some_dgo")
+    with pytest.raises(RobotNotFound, match=r"menagerie:some_dog\?"):
+        load_robot("some_dog")
     with pytest.raises(RobotNotFound, match="menagerie:some_dog: no robot 'am'; did you mean arm"):
         load_robot("menagerie:some_dog/am")
 
