@@ -19,7 +19,7 @@ from impact_posture.robot import guessed_parts as guess
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_collections import COLLECTIONS
 from impact_posture.robot.robot_loader import Located, build_robot, known_robots, load_robot, locate
-from impact_posture.robot.robot_spec import SCHEMA, ModelSpec, RobotSpec, Support
+from impact_posture.robot.robot_spec import SCHEMA, RobotSpec, Support
 from impact_posture.robot.support_polygon import polygon_edges
 from impact_posture.robot.urdf import EXAMPLE_PREFIX, example_robot_data, resolve_path
 from impact_posture.system.escape import toml
@@ -48,7 +48,9 @@ def write_draft(robot: str, options: LoadOptions, out: Path | None, *, force: bo
         hint = "name a .urdf, or write the differences into a file and give it by `config`"
         raise InputError("has its robot.toml already", where=robot, hint=hint)
     # The empty file os.devnull is read in place of a robot.toml beside the URDF.
-    located = locate(robot, LoadOptions(config=os.devnull))
+    located = locate(
+        robot, LoadOptions(config=os.devnull, package_dir=options.package_dir, xacro_arg=options.xacro_arg)
+    )
     in_package = located.source.startswith(COLLECTIONS)
     out = out or (Path(f"{located.urdf.stem}.toml") if in_package else located.home / "robot.toml")
     check_name(out)
@@ -73,7 +75,8 @@ def write_draft(robot: str, options: LoadOptions, out: Path | None, *, force: bo
 
 def draft_spec(located: Located, options: LoadOptions, folder: Path) -> Draft:
     """Return the draft for a URDF, with paths relative to ``folder``."""
-    srdf = resolve_path(options.srdf, Path()) if options.srdf else guess.srdf_near(located.home / located.urdf.name)
+    known = options.srdf or located.spec.model.srdf
+    srdf = resolve_path(known, Path()) if known else guess.srdf_near(located.home / located.urdf.name)
     try:
         robot = _load(located, options, options.root, srdf)
     except UrdfError as error:  # A fixed robot without joints cannot move.
@@ -111,7 +114,7 @@ def draft_spec(located: Located, options: LoadOptions, folder: Path) -> Draft:
         chosen = f"the {_file(robot, 'SRDF')} names {states}{only}"
         draft.key("default_posture", default, chosen, guessed=True)
     draft.lines += ["", "[model]"]
-    if srdf is not None:
+    if srdf is not None and not located.spec.model.srdf:
         draft.key("srdf", _path(srdf, folder), "as --srdf says" if options.srdf else "found near the URDF")
     draft.key("root", root, why, guessed=options.root is None and robot.mjcf is None)
     _model(draft, robot, options, folder)
@@ -141,10 +144,12 @@ def _load(located: Located, options: LoadOptions, root: Root | None, srdf: Path 
     plain = LoadOptions(
         package_dir=options.package_dir, armature=options.armature, lock=options.lock, lock_massless=True
     )
-    model = ModelSpec(root=root, srdf=None if srdf is None else str(srdf), accept_inertias=True)
+    model = replace(located.spec.model, root=root, srdf=None if srdf is None else str(srdf), accept_inertias=True)
     robot = build_robot(located._replace(spec=RobotSpec(model=model)), plain)
     # The shapes of the feet are searched with these settings.
-    settings = RobotSettings(robot=located.source, config=os.devnull, package_dir=options.package_dir)
+    settings = RobotSettings(
+        robot=located.source, config=os.devnull, package_dir=options.package_dir, xacro_arg=options.xacro_arg
+    )
     return replace(robot, settings=settings)
 
 
@@ -152,6 +157,8 @@ def _model(draft: Draft, robot: Robot, options: LoadOptions, folder: Path) -> No
     if options.package_dir:
         dirs = [_path(Path(name), folder) for name in options.package_dir]
         draft.key("package_dirs", dirs, "as --package-dir says")
+    if options.xacro_arg:
+        draft.key("xacro_args", dict(options.xacro_arg), "as --xacro-arg says")
     wheels = () if robot.floating else guess.wheels(robot)
     spinning = [joint for link in guess.propellers(robot) for joint in guess.joints_to(robot, link)]
     if options.lock or wheels or spinning:

@@ -17,7 +17,8 @@ from impact_posture.robot.urdf import MOST_DEGREES_OF_FREEDOM
 from impact_posture.system.arrays import Array
 from impact_posture.system.optional_package import import_mujoco, unwarned
 
-_STATED, _FROM_GEOMS = "in a copy of the file", 1
+# Value of the compiler option ``inertiafromgeom`` with which geoms replace stated inertias.
+_FROM_GEOMS = 1
 # Root element of a file that only works as a part of another file.
 _PART = "mujocoinclude"
 
@@ -165,20 +166,18 @@ def _check_tree(model: Any, path: Path) -> None:
         raise MjcfError("has no movable joint", where=str(path), hint="use `root` free-flyer or another file")
     if model.nv > MOST_DEGREES_OF_FREEDOM:
         fault = f"has {model.nv} degrees of freedom, more than the supported {MOST_DEGREES_OF_FREEDOM}"
-        raise MjcfError(fault, where=str(path), hint=f"remove the joints that hardly matter {_STATED}")
+        raise MjcfError(fault, where=str(path), hint="remove the joints that hardly matter in a copy of the file")
     if model.nflex:
-        raise MjcfError("has flexible bodies", where=str(path), hint=f"remove the <flexcomp> {_STATED}")
+        raise MjcfError("has flexible bodies", where=str(path), hint="remove the <flexcomp> in a copy of the file")
     heavy = np.flatnonzero(~np.isfinite(np.c_[model.body_mass, model.body_inertia]).all(axis=1))
     if heavy.size:
         fault = f"body '{object_name(model, 'body', int(heavy[0]))}' has an infinite mass or inertia"
         raise MjcfError(fault, where=str(path), hint="correct the mass or the size of its geoms")
     free = np.flatnonzero(model.jnt_type == import_mujoco().mjtJoint.mjJNT_FREE)
     if free.size and (free.size > 1 or free[0]):
-        other = object_name(model, "body", int(model.jnt_bodyid[free[-1]]))
-        fault = f"body '{other}' floats beside the robot"
-        raise MjcfError(
-            fault, where=str(path), hint=f"remove this body {_STATED}, or name the robot without its scene"
-        )
+        fault = f"body '{object_name(model, 'body', int(model.jnt_bodyid[free[-1]]))}' floats beside other joints"
+        hint = "remove it in a copy of the file, or put the floating robot first; or name the robot without its scene"
+        raise MjcfError(fault, where=str(path), hint=hint)
 
 
 def equated_joints(model: Any) -> dict[int, Array]:
@@ -200,7 +199,7 @@ def _couplings(model: Any, path: Path) -> tuple[JointCoupling, ...]:
         if second < 0:
             model.jnt_limited[first], model.jnt_range[first] = 1, start + constant
         elif any(curved):
-            hint = f"make it linear {_STATED}, or remove it and `lock` the joint"
+            hint = "make it linear in a copy of the file, or remove it and `lock` the joint"
             raise MjcfError(f"joint '{name}' follows another by a polynomial", where=str(path), hint=hint)
         else:
             other = int(second)
@@ -210,10 +209,10 @@ def _couplings(model: Any, path: Path) -> tuple[JointCoupling, ...]:
         kind = mujoco.mjtEq(int(model.eq_type[k])).name.removeprefix("mjEQ_").lower()
         name = object_name(model, "equality", int(k))
         what = "couples joints by tendons" if kind == "tendon" else "closes a kinematic loop"
-        hint = f"remove it {_STATED}, if the impact can do without, and `lock` or hold the joints that it guides"
+        hint = "if it hardly matters, remove it in a copy of the file and `lock` the joints that it guides"
         raise MjcfError(f"equality '{name}' ({kind}) {what}, which is not supported", where=str(path), hint=hint)
     for name in _coupling_armatures(model):
-        hint = f"remove its armature {_STATED}, or move it to the joints"
+        hint = "remove its armature in a copy of the file, or move it to the joints"
         raise MjcfError(f"the armature of {name} couples joints", where=str(path), hint=hint)
     return composed(couplings, str(path))
 

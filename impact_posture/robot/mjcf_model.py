@@ -48,8 +48,7 @@ def model_of(mjcf: Any) -> pin.Model:
                 joint = model.addJoint(joint, kind, at * before, object_name(mjcf, "joint", j))
                 at = after
             frame = model.addJointFrame(joint, frame)
-        inertia = _inertia(mjcf, b)
-        model.appendBodyToJoint(joint, inertia, at)
+        model.appendBodyToJoint(joint, _inertia(mjcf, b), at)
         frame = model.addBodyFrame(object_name(mjcf, "body", b), joint, at, frame)
         bodies.append((joint, at, frame))
     for s in range(mjcf.nsite):
@@ -136,7 +135,7 @@ def _efforts(mjcf: Any) -> list[float]:
 
     The limits of the actuators of a joint add up, and ``actfrcrange`` limits their sum.
     """
-    efforts, drives = [], [a for a in range(mjcf.nu) if drives_joint(mjcf, a)]
+    efforts, drives = [], [a for a in range(mjcf.nu) if drives_joint(mjcf, a) and mjcf.actuator_gear[a, 0]]
     for j in range(mjcf.njnt):
         driving = [a for a in drives if mjcf.actuator_trnid[a, 0] == j]
         effort = sum(_force(mjcf, a) * abs(mjcf.actuator_gear[a, 0]) for a in driving) if driving else np.inf

@@ -159,6 +159,7 @@ def locate(robot: str, options: LoadOptions) -> Located:
     """Find the files of a robot by name, path or URI."""
     shipped = robots_data() / robot / "robot.toml"
     if "/" not in robot and os.path.isfile(shipped):
+        _check_arguments(options, robot)
         spec, base = read_spec(shipped), shipped.parent
         text = spec.model.urdf or ""
         source = text if text.startswith(EXAMPLE_PREFIX) else f"impact-posture:{robot}/{text}"
@@ -191,10 +192,17 @@ def locate(robot: str, options: LoadOptions) -> Located:
     if urdf.suffix == ".xacro":
         places = [Path(folder).expanduser() for folder in options.package_dir]
         places += [base / Path(folder).expanduser() for folder in folders]
-        urdf = expand_xacro(urdf, {**files.arguments, **(options.xacro_arg or {})}, places, files.packages)
-    elif options.xacro_arg:
-        raise InputError("is not a xacro file", where=str(urdf), hint="leave `xacro_arg` out")
+        arguments = {**files.arguments, **spec.model.xacro_args, **(options.xacro_arg or {})}
+        urdf = expand_xacro(urdf, arguments, places, files.packages)
+    else:
+        _check_arguments(options, str(urdf))
     return Located(spec, urdf, robot, base, spec.name or urdf.stem, home)
+
+
+def _check_arguments(options: LoadOptions, robot: str) -> None:
+    """Raise an error for arguments of a robot that is not a xacro file."""
+    if options.xacro_arg:
+        raise InputError("is not a xacro file", where=robot, hint="leave `xacro_arg` out")
 
 
 def srdf_path(spec: RobotSpec, options: LoadOptions, base: Path) -> Path | None:

@@ -28,6 +28,7 @@ class ModelSpec(_Table):
     # ``None`` keeps the root of an MJCF, and means ``fixed`` for a URDF.
     root: Root | None = None
     package_dirs: tuple[str, ...] = ()
+    xacro_args: dict[str, str] = field(default_factory=dict)
     lock: tuple[str, ...] = ()
     lock_massless: bool = False
     # Whether impossible inertias, which some published URDFs contain, are warnings instead of errors.

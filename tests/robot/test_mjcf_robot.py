@@ -225,7 +225,7 @@ _TENDON = '<fixed name="cord"{}><joint joint="shoulder" coef="1"/><joint joint="
         (_with(ARM, tendon=_TENDON.format(""), equality='<tendon tendon1="cord"/>'), "(tendon) couples joints by"),
         (_with(ARM, tendon=_TENDON.format(' armature="1"')), "the armature of tendon 'cord' couples joints"),
         (QUADRUPED.replace("</worldbody>", '<body name="ball"><freejoint/><geom size=".1"/></body></worldbody>')
-         .replace("<key ", "<!--").replace('0 .5 .9 "/>', "-->"), "body 'ball' floats beside the robot"),
+         .replace("<key ", "<!--").replace('0 .5 .9 "/>', "-->"), "body 'ball' floats beside other joints"),
         ("<mujoco><worldbody/></mujoco>", "has no body"),
         ("<mujocoinclude><worldbody><body/></worldbody></mujocoinclude>", "name the file that includes"),
         ('<mujoco><worldbody><body><geom size="1"/></body></worldbody></mujoco>', "has no movable joint"),

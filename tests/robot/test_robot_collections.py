@@ -120,7 +120,8 @@ def test_robot_descriptions(packages: Path, capsys: pytest.CaptureFixture[str]) 
 
 def test_draft_is_not_written_into_a_collection(packages: Path) -> None:
     path, _ = write_draft("robot_descriptions:two_description", LoadOptions(), None)
-    assert path == Path("two.toml") and path.is_file()
+    assert path == Path("two.toml") and "srdf" not in path.read_text()
+    assert load_robot("robot_descriptions:two_description", config="two.toml").default_posture == "ready"
 
 
 def test_packages_that_are_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:

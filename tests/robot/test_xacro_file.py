@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from impact_posture.collision.coal_geometry import read_shapes
-from impact_posture.config.problem_settings import ProblemSettings
+from impact_posture.config.problem_settings import LoadOptions, ProblemSettings
 from impact_posture.config.text_parsers import parse_xacro_arguments
+from impact_posture.draft.draft import write_draft
 from impact_posture.errors import InputError, PackageNotFound, UrdfError
 from impact_posture.posture.formulation.problem_file import dump_settings
 from impact_posture.robot.robot_loader import load_robot
@@ -77,6 +78,15 @@ def test_defaults_and_arguments(arm: str) -> None:
 def test_robot_toml_beside_the_xacro_file_is_read(arm: str) -> None:
     (Path(arm).parent / "robot.toml").write_text('schema = "impact-posture/robot/1"\nname = "mine"\n')
     assert load_robot(arm).name == "mine"
+
+
+def test_draft_keeps_the_arguments(arm: str) -> None:
+    path, draft = write_draft(arm, LoadOptions(xacro_arg={"hand": "true"}), None)
+    assert path == Path(arm).parent / "robot.toml" and 'xacro_args = { "hand" = "true" }' in draft.text
+    assert load_robot(arm).joint_names == ("one_joint", "hand_joint")
+    assert load_robot(arm, xacro_arg={"hand": "false"}).joint_names == ("one_joint",)
+    with pytest.raises(InputError, match="panda: is not a xacro file"):
+        load_robot("panda", xacro_arg={"hand": "false"})
 
 
 def test_command_line_and_problem_file(arm: str, tmp_path: Path) -> None:
