@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import io
 import json
-import os
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -22,7 +20,7 @@ from impact_posture.simulation.controllers.controller_factory import CONTROLLERS
 from impact_posture.simulation.run import Run
 from impact_posture.simulation.scenario_file import scenario_path
 from impact_posture.system.libraries import source_key
-from impact_posture.system.output_folder import parents_of, write_whole
+from impact_posture.system.output_folder import parents_of, used_alone, write_whole
 from impact_posture.system.processes import fork_map, undone
 from impact_posture.system.text_files import read_text
 
@@ -49,27 +47,9 @@ class JobStore:
             OutputError: The folder cannot be created or read, or another command uses it.
         """
         with parents_of(self.folder):
-            lock = self._lock()
-            try:
-                with undone(self._remove_empty):
-                    yield self
-            finally:
-                os.close(lock)
-
-    def _lock(self) -> int:
-        """Lock the folder and return its file descriptor.  The folder is locked while the descriptor is open."""
-        self._make_folder()
-        lock = os.open(self.folder, os.O_RDONLY)
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            os.close(lock)
-            what, hint = "another command stores its runs there", "wait until it ends, or choose another `out`"
-            raise OutputError(what, where=str(self.folder), hint=hint) from None
-        except OSError:
-            # Some file systems do not support locks.  On them, the folder is not locked.
-            pass
-        return lock
+            self._make_folder()
+            with used_alone(self.folder, self.folder), undone(self._remove_empty):
+                yield self
 
     def _make_folder(self) -> None:
         try:

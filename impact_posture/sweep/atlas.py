@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 from collections.abc import Iterator
@@ -19,7 +18,7 @@ from impact_posture.sweep.case_solver import CaseSolver
 from impact_posture.sweep.shard_table import passes_of, read_postures
 from impact_posture.sweep.sweep_file import Sweep
 from impact_posture.system.libraries import source_key
-from impact_posture.system.output_folder import check_output, is_ours, write_record, write_whole
+from impact_posture.system.output_folder import check_output, is_ours, used_alone, write_record, write_whole
 from impact_posture.system.text_files import read_text
 from impact_posture.version import __version__
 
@@ -82,15 +81,7 @@ class Atlas:
         if known["key"] != self._key:
             other = "another version" if known["version"] != __version__ else "another sweep, or other code or robots"
             raise OutputError(f"contains results of {other}", where=str(self.folder), hint="choose another `out`")
-        with manifest.open("rb") as held:
-            try:
-                fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                hint = "wait for it, or choose another `out`"
-                raise OutputError("is in use by another process", where=str(self.folder), hint=hint) from None
-            except OSError:
-                # Some file systems do not support locks.  On them, the sweep runs without a lock.
-                pass
+        with used_alone(self.folder, manifest):
             for part in self.folder.glob("*/case=*/.shard-*.parquet.*.part"):
                 with suppress(OSError):
                     part.unlink()

@@ -7,6 +7,7 @@ folder.  Other files are called foreign.  ``--force`` replaces a folder only if 
 from __future__ import annotations
 
 import errno
+import fcntl
 import json
 import os
 import secrets
@@ -237,6 +238,28 @@ def _replace(beside: Path, out: Path, force: bool, kind: Kind) -> None:
     swept = out.with_name(f"{SCRATCH}{secrets.token_hex(4)}")
     os.rename(old, swept)
     remove_scratch(swept)
+
+
+@contextmanager
+def used_alone(folder: Path, lock: Path) -> Iterator[None]:
+    """Lock the file or folder ``lock`` during the block, so that no other command uses ``folder``.
+
+    Raises:
+        OutputError: Another command uses the folder.
+    """
+    descriptor = os.open(lock, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            hint = "wait until it ends, or choose another `out`"
+            raise OutputError("is in use by another command", where=str(folder), hint=hint) from None
+        except OSError:
+            # Some file systems do not support locks.  On them, the folder is not locked.
+            pass
+        yield
+    finally:
+        os.close(descriptor)
 
 
 @contextmanager

@@ -207,7 +207,7 @@ def test_a_file_in_the_place_of_the_store_is_refused(tmp_path: Path) -> None:
 def test_two_commands_cannot_share_a_store(tmp_path: Path) -> None:
     with store_beside(tmp_path / "both") as store:
         done = start("compare", "aerial-lateral", "--out", "both", cwd=tmp_path)
-        refused(done, 1, ".both.runs: another command stores its runs there", "wait until it ends")
+        refused(done, 1, ".both.runs: is in use by another command", "wait until it ends")
         assert store.folder.is_dir()
     assert not list(tmp_path.iterdir())
 
