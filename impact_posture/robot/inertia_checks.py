@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -165,7 +166,7 @@ def _numbers(tag: ET.Element, key: str, link: str, where: str, count: int = 1) -
         values = [float(word) for word in text.split()]
     except ValueError:
         values = []
-    if len(values) != count or not np.isfinite(values).all():
+    if len(values) != count or not all(map(math.isfinite, values)):
         fault = f"link '{link}': {tag.tag} {key}='{text}' is not {'a number' if count == 1 else f'{count} numbers'}"
         raise InertiaError(fault, where=where, hint="correct it")
     return values
