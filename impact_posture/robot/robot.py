@@ -66,6 +66,19 @@ class CompiledMjcf:
     joints: pin.Model
     start: Array
 
+    @cached_property
+    def passive(self) -> tuple[Array, ...]:
+        """Arrays of the model that determine damping, friction loss and springs of the joints."""
+        names = (
+            "dof_damping",
+            "dof_dampingpoly",
+            "dof_frictionloss",
+            "jnt_stiffness",
+            "jnt_stiffnesspoly",
+            "qpos_spring",
+        )
+        return tuple(np.array(getattr(self.model, name)) for name in names)
+
 
 @dataclass(frozen=True, eq=False)
 class Robot:
@@ -232,9 +245,10 @@ class Robot:
 
     @cached_property
     def data_sha256(self) -> str:
-        """Hash of all data except shapes: dynamics, kinematics, limits, and ``robot.toml``."""
+        """Hash of all data except shapes: dynamics, kinematics, limits, passive forces, and ``robot.toml``."""
         efforts, rates = rounded(self.model.effortLimit), rounded(self.model.velocityLimit)
-        return hash_of((self.model_sha256, self.kinematics_sha256, efforts, rates, repr(self.spec)))
+        passive = [rounded(values) for values in self.mjcf.passive] if self.mjcf is not None else []
+        return hash_of((self.model_sha256, self.kinematics_sha256, efforts, rates, repr(self.spec), *passive))
 
     @checked
     def frame_id(self, name: str) -> int:

@@ -121,6 +121,11 @@ def test_limits_efforts_and_armature(tmp_path: Path) -> None:
     assert any("damping (1), friction loss (1)" in line for line in arm.warnings)
 
 
+def test_the_hash_of_the_data_contains_passive_forces(tmp_path: Path) -> None:
+    arm, damped = loaded(tmp_path, ARM), loaded(tmp_path, ARM.replace('damping="1"', 'damping="2"'))
+    assert arm.model_sha256 == damped.model_sha256 and arm.data_sha256 != damped.data_sha256
+
+
 def test_root_option_adds_and_removes_the_free_joint(tmp_path: Path) -> None:
     dog, fixed = loaded(tmp_path, QUADRUPED), loaded(tmp_path, QUADRUPED, root="fixed")
     assert dog.root == "free-flyer" and dog.nv == 18

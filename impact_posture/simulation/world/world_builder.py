@@ -156,13 +156,14 @@ def _set_passive(mjcf: Mjcf, robot: Robot) -> None:
     if robot.mjcf is None:
         return
     source = robot.mjcf.model
+    damping, damping_poly, friction, stiffness, stiffness_poly, rest = robot.mjcf.passive
     for index in joint_range(robot.model):
         j = robot.mjcf.joints.getJointId(robot.model.names[index]) - 1
         dof, joint = source.jnt_dofadr[j], mjcf.spec.joint(mjcf.joints[index][0])
-        joint.damping = np.r_[source.dof_damping[dof], source.dof_dampingpoly[dof]]
-        joint.frictionloss = source.dof_frictionloss[dof]
-        joint.stiffness = np.r_[source.jnt_stiffness[j], source.jnt_stiffnesspoly[j]]
-        joint.springref = source.qpos_spring[source.jnt_qposadr[j]]
+        joint.damping = np.r_[damping[dof], damping_poly[dof]]
+        joint.frictionloss = friction[dof]
+        joint.stiffness = np.r_[stiffness[j], stiffness_poly[j]]
+        joint.springref = rest[source.jnt_qposadr[j]]
 
 
 def _placement(robot: Robot, numeric: Numeric, shape: Shape, normal: Array | None) -> pin.SE3:
