@@ -54,7 +54,8 @@ def touching_by_design(robot: Robot, shapes: Sequence[pin.GeometryObject], pairs
     where one slides in the other along one line, need to touch only at a named posture.
     """
     data, touch = robot.model.createData(), touch_of(shapes)
-    sliding = [pair for pair in pairs if _telescopic(robot.model, *(shapes[k].parentJoint for k in pair))]
+    pin.computeJointJacobians(robot.model, data, robot.posture())
+    sliding = [pair for pair in pairs if _telescopic(robot.model, data, *(shapes[k].parentJoint for k in pair))]
     nested: set[Pair] = set()
     for q in robot.postures.values() if sliding else ():
         pin.forwardKinematics(robot.model, data, q)
@@ -68,13 +69,16 @@ def touching_by_design(robot: Robot, shapes: Sequence[pin.GeometryObject], pairs
     return [pair for pair in pairs if pair in nested or count.get(pair, 0) > _POSTURES / 2]
 
 
-def _telescopic(model: pin.Model, first: int, second: int) -> bool:
-    """Return whether one joint carries the other, and all joints between them slide along the same direction."""
+def _telescopic(model: pin.Model, data: pin.Data, first: int, second: int) -> bool:
+    """Return whether one joint carries the other, and all joints between them slide along the same direction.
+
+    ``data`` contains the Jacobians of the joints at any posture.
+    """
     carried, carrier = (set(model.supports[k]) for k in sorted((first, second), reverse=True))
     if not carrier < carried:
         return False
     columns = [k for joint in carried - carrier for k in range(*v_slice(model, joint).indices(model.nv))]
-    J = np.array(pin.computeJointJacobians(model, model.createData(), pin.neutral(model)))[:, columns]
+    J = data.J[:, columns]
     return not J[3:].any() and np.linalg.matrix_rank(J, _PARALLEL) == 1
 
 

@@ -3,7 +3,7 @@
 A configuration contains both joints, and ``q_follower = ratio · q_leader + offset``.  All generalized velocities
 have the form ``ν = C ν``, where the matrix ``C`` copies the leader's velocity, times the ratio, to the follower and
 ignores the follower's own entry.  ``C`` is a projector.  The dynamics of the coupled robot have the mass matrix
-``CᵀMC`` and the Jacobian ``JC`` (Featherstone 2008, section 8.4); the motor of the leader exerts ``Cᵀτ``.
+``CᵀMC`` and the Jacobian ``JC``.  The motor of the leader exerts ``Cᵀτ``.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ def urdf_couplings(root: ET.Element, where: str) -> tuple[tuple[JointCoupling, .
     """Return the couplings that the ``<mimic>`` tags of a URDF state, and warnings about tags that state none.
 
     The tags of coupled joints in ``root`` change.  Continuous joints become revolute joints without limits, because a
-    follower depends on the whole angle, not only on its cosine and sine.  The limits of a joint that mimics a fixed
-    joint become equal.
+    follower depends on the whole angle, not only on its cosine and sine.  The limits of a joint become equal if it
+    mimics a fixed joint, or with the multiplier zero.
 
     Raises:
         UrdfError: Joints mimic each other in a circle, a planar or floating joint is coupled, or a number is invalid.
@@ -77,22 +77,20 @@ def urdf_couplings(root: ET.Element, where: str) -> tuple[tuple[JointCoupling, .
             warnings.append(f"{fault} (did you mean {near}?): it moves by itself; correct its <mimic>")
             continue
         ratio, offset = (_number(tag, key, value, where) for key, value in (("multiplier", 1.0), ("offset", 0.0)))
-        stated[name] = JointCoupling(name, leader, ratio, offset)
-    couplings = []
-    for c in composed(stated, where):
-        if joints[c.leader].get("type") == "fixed":
-            _set_limits(joints[c.follower], c.offset, c.offset)
-            continue
-        couplings.append(c)
+        if ratio and joints[leader].get("type") != "fixed":
+            stated[name] = JointCoupling(name, leader, ratio, offset)
+        else:
+            _set_limits(joint, offset, offset)
+    couplings = composed(stated, where)
+    for c in couplings:
         for joint in (joints[c.follower], joints[c.leader]):
             kind = joint.get("type")
             if kind == "continuous":
-                joint.set("type", "revolute")
                 _set_limits(joint, -2 * ENDLESS, 2 * ENDLESS)
             elif kind not in ("revolute", "prismatic"):
                 fault = f"joint '{joint.get('name')}' of type {kind} is coupled by <mimic>"
                 raise UrdfError(fault, where=where, hint="only revolute, prismatic and continuous joints can be")
-    return tuple(couplings), warnings
+    return couplings, warnings
 
 
 def _number(tag: ET.Element, key: str, default: float, where: str) -> float:
@@ -110,6 +108,8 @@ def _set_limits(joint: ET.Element, low: float, high: float) -> None:
     limit = joint.find("limit")
     limit = ET.SubElement(joint, "limit", effort="0", velocity="0") if limit is None else limit
     limit.attrib |= {"lower": str(low), "upper": str(high)}
+    if joint.get("type") == "continuous":
+        joint.set("type", "revolute")
 
 
 def present(couplings: Iterable[JointCoupling], model: pin.Model) -> tuple[JointCoupling, ...]:
@@ -136,7 +136,7 @@ def couple_limits(model: pin.Model, couplings: Iterable[JointCoupling]) -> list[
     couplings = tuple(couplings)
     for c in couplings:
         f, lead = _in_q(model, c.follower), _in_q(model, c.leader)
-        if c.ratio and low[f] < high[f]:
+        if low[f] < high[f] and low[lead] < high[lead]:
             ends = sorted((bound - c.offset) / c.ratio for bound in (low[f], high[f]))
             if max(low[lead], ends[0]) < min(high[lead], ends[1]):
                 low[lead], high[lead] = max(low[lead], ends[0]), min(high[lead], ends[1])
@@ -145,7 +145,7 @@ def couple_limits(model: pin.Model, couplings: Iterable[JointCoupling]) -> list[
                 fault = f"the position limits {stated} of '{c.follower}' leave '{c.leader}' {other}, which it mimics"
                 warnings.append(f"{fault}, no range, so they are not used")
         f, lead = _in_v(model, c.follower), _in_v(model, c.leader)
-        if c.ratio and 0 < fast[f] < ENDLESS:
+        if 0 < fast[f] < ENDLESS:
             limit = fast[f] / abs(c.ratio)
             fast[lead] = min(fast[lead], limit) if fast[lead] > 0 else limit
             slow[lead] = -fast[lead]

@@ -184,11 +184,11 @@ def _check_tree(model: Any, path: Path) -> None:
         raise MjcfError(fault, where=str(path), hint=hint)
 
 
-def equated_joints(model: Any) -> dict[int, Array]:
-    """Return the joints that equality constraints couple: joint → other joint (−1 for none) and polynomial, (6,)."""
+def equated_joints(model: Any) -> list[tuple[int, Array]]:
+    """Return the joints that equality constraints couple, each with the other joint (−1 for none) and polynomial."""
     joint = import_mujoco().mjtEq.mjEQ_JOINT
     active = np.flatnonzero(model.eq_active0 & (model.eq_type == joint))
-    return {int(model.eq_obj1id[k]): np.r_[model.eq_obj2id[k], model.eq_data[k, :5]] for k in active}
+    return [(int(model.eq_obj1id[k]), np.r_[model.eq_obj2id[k], model.eq_data[k, :5]]) for k in active]
 
 
 def _couplings(model: Any, path: Path) -> tuple[JointCoupling, ...]:
@@ -198,9 +198,11 @@ def _couplings(model: Any, path: Path) -> tuple[JointCoupling, ...]:
     that a constraint holds at a constant gets equal limits.
     """
     mujoco, couplings = import_mujoco(), dict[str, JointCoupling]()
-    for first, (second, constant, ratio, *curved) in equated_joints(model).items():
+    for first, (second, constant, ratio, *curved) in equated_joints(model):
         name, start = object_name(model, "joint", first), model.qpos0[model.jnt_qposadr[first]]
-        if second < 0:
+        if name in couplings:
+            raise MjcfError(f"joint '{name}' follows two joints", where=str(path), hint=f"remove one {_STATED}")
+        if second < 0 or not (ratio or any(curved)):
             model.jnt_limited[first], model.jnt_range[first] = 1, start + constant
         elif any(curved):
             hint = "make it linear in a copy of the file, or remove it and `lock` the joint"

@@ -88,7 +88,7 @@ def _joint(mjcf: Any, j: int) -> tuple[pin.JointModel, pin.SE3, pin.SE3]:
         family, back = "P", pin.SE3(np.eye(3), -reference * axis)
     else:
         # A coupled joint depends on the whole angle, not only on its cosine and sine.
-        equated = any(j in (joint, other[0]) for joint, other in equated_joints(mjcf).items())
+        equated = any(j in (joint, other[0]) for joint, other in equated_joints(mjcf))
         family = "R" if mjcf.jnt_limited[j] or equated else "RUB"
         back = pin.SE3(pin.AngleAxis(-reference, axis).matrix(), np.zeros(3))
     if axis.max() == 1.0:

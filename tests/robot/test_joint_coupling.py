@@ -186,10 +186,11 @@ def test_a_mimic_of_a_fixed_joint_is_held_and_a_continuous_joint_gets_one_angle(
     loaded = load(
         tmp_path, *parts, joint("a", "s u", kind="continuous"), joint("weld", "u f", kind="fixed", more=""),
         joint("b", "f t", kind="continuous", more=mimic("a", 0.5)), link("g", 1, "0 0 0.1"),
-        joint("c", "t g", more=MOVED + mimic("weld", 3.0, 0.25)),
+        joint("c", "t g", more=MOVED + mimic("weld", 3.0, 0.25)), link("h", 1, "0 0 0.1"),
+        joint("d", "g h", kind="continuous", more=mimic("a", 0.0, -0.5)),
     )  # fmt: skip
-    assert loaded.nq == loaded.nv == 3 and loaded.couplings == (JointCoupling("b", "a", 0.5, 0.0),)
-    assert loaded.posture()[2] == 0.25 and loaded.fixed_with(()) == ("c",)
+    assert loaded.nq == loaded.nv == 4 and loaded.couplings == (JointCoupling("b", "a", 0.5, 0.0),)
+    assert loaded.posture()[2:].tolist() == [0.25, -0.5] and loaded.fixed_with(()) == ("c", "d")
     assert not [w for w in loaded.warnings if "continuous" in w]
 
 
@@ -230,6 +231,7 @@ def test_joint_equalities_of_an_mjcf_are_couplings(tmp_path: Path) -> None:
     """``data`` of the constraint relates changes from the reference positions."""
     pytest.importorskip("mujoco")
     equality = '<equality><joint joint1="wrist" joint2="shoulder" polycoef=".1 -2 {} 0 0"/></equality></mujoco>'
+    twice = '<joint joint1="wrist" joint2="elbow"/>'
     path = tmp_path / "arm.xml"
     path.write_text(ARM.replace("</mujoco>", equality.format(0)))
     loaded = load_robot(str(path))
@@ -237,6 +239,9 @@ def test_joint_equalities_of_an_mjcf_are_couplings(tmp_path: Path) -> None:
     assert loaded.nq == loaded.nv == 4
     path.write_text(ARM.replace("</mujoco>", equality.format(1)))
     with pytest.raises(UrdfError, match="'wrist' follows another by a polynomial"):
+        load_robot(str(path))
+    path.write_text(ARM.replace("</mujoco>", equality.format(0).replace("</equality>", f"{twice}</equality>")))
+    with pytest.raises(UrdfError, match="'wrist' follows two joints"):
         load_robot(str(path))
     held = '<equality><joint joint1="elbow" polycoef=".3 0 0 0 0"/></equality></mujoco>'
     path.write_text(ARM.replace("</mujoco>", held))
