@@ -91,7 +91,7 @@ class ImpactLimits:
         spread = supported_inverse(state, self._contacts) @ J.T
         mass = np.linalg.pinv(J @ spread, rcond=_RANK, hermitian=True)
         impulse = -(1 + self.restitution) * np.outer(mass @ self._normal, self._normal @ J)
-        return spread @ impulse, J.T @ impulse
+        return spread @ impulse, state.robot.coupling_matrix.T @ J.T @ impulse
 
     def rows(self, state: State) -> tuple[Array, Array, Array]:
         """Return the rows on ``ν̇``, their lower bounds and their upper bounds.
