@@ -201,7 +201,7 @@ def _couplings(model: Any, path: Path) -> tuple[JointCoupling, ...]:
     for first, (second, constant, ratio, *curved) in equated_joints(model):
         name, start = object_name(model, "joint", first), model.qpos0[model.jnt_qposadr[first]]
         if name in couplings:
-            raise MjcfError(f"joint '{name}' follows two joints", where=str(path), hint=f"remove one {_STATED}")
+            raise MjcfError(f"joint '{name}' follows two joints", where=str(path), hint="remove one")
         if second < 0 or not (ratio or any(curved)):
             model.jnt_limited[first], model.jnt_range[first] = 1, start + constant
         elif any(curved):
