@@ -53,12 +53,17 @@ class Layout:
     leaves: frozenset[int]
 
 
-def lay_out(graph: Graph, functions: Sequence[Sequence[str]], block: int = _BLOCK) -> Layout:
+def lay_out(
+    graph: Graph, functions: Sequence[Sequence[str]], block: int = _BLOCK, *, in_order: bool = False
+) -> Layout:
     """Divide a graph into blocks of at most ``block`` statements.
 
-    ``functions`` contains the names of the outputs of each exported function.
+    ``functions`` contains the names of the outputs of each exported function.  With ``in_order``, operations keep the
+    order of the graph.
     """
-    order = _depth_first(graph, [k for names in functions for name in names for k in graph.outputs[name]])
+    order = depth_first(graph, [k for names in functions for name in names for k in graph.outputs[name]])
+    if in_order:
+        order.sort()
     angles, trig = _trig(graph, order)
     leaves = frozenset(k for k in order if graph.nodes[k].op in ("const", "in", "lane") or k in trig)
     needed = _needed(graph, functions, leaves)
@@ -127,7 +132,7 @@ def _sources(graph: Graph, leaves: Set[int], k: int) -> list[int]:
     return [] if k in leaves else [_source(graph, a) for a in graph.nodes[k].operands]
 
 
-def _depth_first(graph: Graph, roots: Sequence[int]) -> list[int]:
+def depth_first(graph: Graph, roots: Sequence[int]) -> list[int]:
     """Return the nodes that the roots need.  Each operand comes shortly before the operation that uses the operand.
 
     The operand with the longest chain of operations comes last, so that its result is used immediately.

@@ -14,6 +14,7 @@ from impact_posture.codegen.c_literals import Real
 from impact_posture.codegen.export_functions import SIGNATURES, lengths
 from impact_posture.codegen.export_library import Exported, ExportLibrary, NamedObjective, export_library
 from impact_posture.codegen.expression_graph import ARITHMETIC, Graph
+from impact_posture.codegen.limb_order import limb_of_coordinates, order_by_limb
 from impact_posture.codegen.sum_order import reorder_sums
 from impact_posture.config.cached_values import cached
 from impact_posture.system.libraries import source_key
@@ -35,6 +36,8 @@ _BATCH_BLOCK = 60
 # Largest number of operations of a CUDA function whose blocks are inlined, so that its values can be in registers.
 # The compiler stores more values of a longer function in memory than its separate blocks store.
 _INLINED = 6000
+# Largest number of statements in a block that is not inlined.
+_CUDA_BLOCK = 100
 
 
 @dataclass(frozen=True)
@@ -148,15 +151,22 @@ def _generate(
             batch |= lanes
         batches.append(batch)
     work = [(types[width], f"w{width if width > 1 else ''}", count) for width, count in sorted(layout.sizes.items())]
+    limb_of = limb_of_coordinates(robot.model)
+    cuda_source = _cuda(library, scalars, limb_of, normals, prefix, real) if cuda else None
     stack_bytes = -(-(largest + _FRAMES) // 64) * 64
     return CSource(
         portable, constants.text(types), tuple(emitter.blocks), angles, room, tuple(work), tuple(functions),
-        tuple(batches), stack_bytes, _cuda(library, scalars, normals, prefix, real) if cuda else None,
+        tuple(batches), stack_bytes, cuda_source,
     )  # fmt: skip
 
 
 def _cuda(
-    library: ExportLibrary, scalars: Graph, normals: Mapping[str, Sequence[float]], prefix: str, real: Real
+    library: ExportLibrary,
+    scalars: Graph,
+    limb_of: Mapping[int, int],
+    normals: Mapping[str, Sequence[float]],
+    prefix: str,
+    real: Real,
 ) -> CudaSource:
     graph = reorder_sums(scalars)
     whole = [lay_out(graph, [function.outputs], len(graph.nodes)) for function in library.functions]
@@ -164,7 +174,9 @@ def _cuda(
     constants = Constants(prefix, real, "static __constant__ const")
     functions = []
     for function, layout in zip(library.functions, whole, strict=True):
-        layout = layout if inlined else lay_out(graph, [function.outputs])
+        if not inlined:
+            ordered = order_by_limb(scalars, function.outputs, limb_of)
+            layout = lay_out(ordered, [function.outputs], _CUDA_BLOCK, in_order=True)
         emitter = Emitter(layout, f"{function.stem}_{function.name}", real, {1: real.name}, constants)
         own = {"blocks": emitter.blocks, "angles": _angles(layout), "work": layout.sizes.get(1, 0)}
         functions.append(_variables(function, emitter, [b.call for b in emitter.blocks], normals) | own)

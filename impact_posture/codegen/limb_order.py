@@ -1,0 +1,108 @@
+"""Order operations limb by limb, and compute values again instead of keeping them, for processors with few registers.
+
+A sweep over the kinematic tree visits each limb once, and a gradient needs several sweeps.  A limb has few values,
+and the body passes few values between limbs.  So a visit computes the values of earlier visits to the same limb
+again, and only values of the body are kept.  For a humanoid, this doubles the operations and halves the memory.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+
+import pinocchio as pin
+
+from impact_posture.codegen.block_layout import depth_first
+from impact_posture.codegen.expression_graph import COSINE, SINE, Graph
+
+# A visit of fewer operations uses kept values, because computing them again would take longer than the visit.
+_SHORT = 100
+
+
+def limb_of_coordinates(model: pin.Model) -> dict[int, int]:
+    """Return index in ``q`` → number of the limb; 0 for joints of the body.
+
+    A limb is a chain of joints without branches, up to its end.
+    """
+    parents, limbs = list(model.parents), [0] * model.njoints
+    children = Counter(parents[1:])
+    body = {i for i in range(model.njoints) if children[i] > 1}
+    for i in range(model.njoints - 1, 0, -1):
+        body |= {parents[i]} if i in body else set()
+    for i in range(1, model.njoints):
+        limbs[i] = 0 if i in body else limbs[parents[i]] or i
+    return {
+        k: limbs[i] for i in range(1, model.njoints) for k in range(model.idx_qs[i], model.idx_qs[i] + model.nqs[i])
+    }
+
+
+def order_by_limb(graph: Graph, outputs: Sequence[str], limb_of: Mapping[int, int]) -> Graph:
+    """Return a graph with the same outputs, whose nodes are in the order in which they should be computed.
+
+    ``limb_of`` is the result of :func:`limb_of_coordinates`.
+    """
+    nodes = graph.nodes
+    order = depth_first(graph, [k for name in outputs for k in graph.outputs[name]])
+    leaves = {k for k in order if nodes[k].op in ("const", "in")}
+    leaves |= {k for k in order if nodes[k].op in (SINE, COSINE) and nodes[nodes[k].args[0]].op == "in"}
+    limb = _limbs(graph, order, leaves, limb_of)
+    visit = dict.fromkeys(leaves, 0)
+    for k in order:
+        if k not in leaves:
+            visit[k] = max((visit[a] + (limb[a] != limb[k]) for a in nodes[k].operands if a not in leaves), default=0)
+    computed = sorted((k for k in order if k not in leaves), key=lambda k: (visit[k], limb[k]))
+    rank = {k: i for i, k in enumerate(computed)}
+    sizes = Counter((visit[k], limb[k]) for k in computed)
+    ordered = Graph(graph.inputs)
+    new: dict[int, int] = {}
+    fresh: set[int] = set()
+
+    def copy(k: int) -> None:
+        args = nodes[k].args if nodes[k].op in ("const", "in") else tuple(new[a] for a in nodes[k].args)
+        ordered.nodes.append(nodes[k]._replace(args=args))
+        new[k] = len(ordered.nodes) - 1
+
+    for k in order:
+        if k in leaves:
+            copy(k)
+    place = (0, 0)
+    for k in computed:
+        if (visit[k], limb[k]) != place:
+            place = visit[k], limb[k]
+            fresh.clear()
+        again = {k}
+        waiting = [k] if limb[k] and sizes[place] >= _SHORT else []
+        while waiting:
+            missing = set(nodes[waiting.pop()].operands) - leaves - fresh - again
+            missing = {a for a in missing if limb[a] == limb[k]}
+            again |= missing
+            waiting += missing
+        for a in sorted(again - fresh, key=rank.__getitem__):
+            copy(a)
+        fresh |= again
+    ordered.outputs = {name: [new[k] for k in graph.outputs[name]] for name in outputs}
+    return ordered
+
+
+def _limbs(graph: Graph, order: Sequence[int], leaves: set[int], limb_of: Mapping[int, int]) -> dict[int, int]:
+    """Return node → limb on whose joints the node depends; 0 if it depends on no limb or on several limbs.
+
+    A value of the body and of one limb belongs to the limb.  But if only the body uses this value, it is a partial
+    sum over limbs and belongs to the body.
+    """
+    nodes, limb = graph.nodes, dict[int, int]()
+    users: dict[int, set[int]] = {}
+    for k in order:
+        node = nodes[k]
+        if node.op == "in":
+            limb[k] = limb_of[node.args[1]] if graph.inputs[node.args[0]] == "q" else 0
+            continue
+        several = {limb[a] for a in node.operands} - {0}
+        limb[k] = several.pop() if len(several) == 1 else 0
+        for a in node.operands:
+            users.setdefault(a, set()).add(k)
+    for k in reversed(order):
+        of_body = any(limb[a] == 0 and nodes[a].op != "const" for a in nodes[k].operands)
+        if k not in leaves and of_body and all(limb[u] == 0 for u in users.get(k, ())):
+            limb[k] = 0
+    return limb
