@@ -54,8 +54,10 @@ def touching_by_design(robot: Robot, shapes: Sequence[pin.GeometryObject], pairs
     where one slides in the other along one line, need to touch only at a named posture.
     """
     data, touch = robot.model.createData(), touch_of(shapes)
-    pin.computeJointJacobians(robot.model, data, robot.posture())
-    sliding = [pair for pair in pairs if _telescopic(robot.model, data, *(shapes[k].parentJoint for k in pair))]
+    jacobians = np.array(pin.computeJointJacobians(robot.model, data, robot.posture()))
+    columns = [range(*v_slice(robot.model, joint).indices(robot.nv)) for joint in range(robot.model.njoints)]
+    supports, joints = [set(line) for line in robot.model.supports], [int(shape.parentJoint) for shape in shapes]
+    sliding = [(i, j) for i, j in pairs if _telescopic(jacobians, columns, supports[joints[i]], supports[joints[j]])]
     nested: set[Pair] = set()
     for q in robot.postures.values() if sliding else ():
         pin.forwardKinematics(robot.model, data, q)
@@ -69,16 +71,15 @@ def touching_by_design(robot: Robot, shapes: Sequence[pin.GeometryObject], pairs
     return [pair for pair in pairs if pair in nested or count.get(pair, 0) > _POSTURES / 2]
 
 
-def _telescopic(model: pin.Model, data: pin.Data, first: int, second: int) -> bool:
+def _telescopic(jacobians: Array, columns: Sequence[range], first: set[int], second: set[int]) -> bool:
     """Return whether one joint carries the other, and all joints between them slide along the same direction.
 
-    ``data`` contains the Jacobians of the joints at any posture.
+    ``first`` and ``second`` are the joints that move a joint, with this joint.  ``jacobians``, shape (6, nv), contain
+    the ``columns`` of each joint.
     """
-    carried, carrier = (set(model.supports[k]) for k in sorted((first, second), reverse=True))
-    if not carrier < carried:
+    if not (first < second or second < first):
         return False
-    columns = [k for joint in carried - carrier for k in range(*v_slice(model, joint).indices(model.nv))]
-    J = data.J[:, columns]
+    J = jacobians[:, [k for joint in first ^ second for k in columns[joint]]]
     return not J[3:].any() and np.linalg.matrix_rank(J, _PARALLEL) == 1
 
 
