@@ -186,9 +186,32 @@ def _check_tree(model: Any, path: Path) -> None:
 
 def equated_joints(model: Any) -> list[tuple[int, Array]]:
     """Return the joints that equality constraints couple, each with the other joint (−1 for none) and polynomial."""
-    joint = import_mujoco().mjtEq.mjEQ_JOINT
-    active = np.flatnonzero(model.eq_active0 & (model.eq_type == joint))
-    return [(int(model.eq_obj1id[k]), np.r_[model.eq_obj2id[k], model.eq_data[k, :5]]) for k in active]
+    joint, equated = import_mujoco().mjtEq.mjEQ_JOINT, list[tuple[int, Array]]()
+    for k in np.flatnonzero(model.eq_active0):
+        if model.eq_type[k] == joint:
+            equated.append((int(model.eq_obj1id[k]), np.r_[model.eq_obj2id[k], model.eq_data[k, :5]]))
+        elif terms := _tendon_terms(model, int(k)):
+            followers = {first for first, _ in equated}
+            first, *rest = sorted(terms, key=lambda j: j in followers)
+            other, ratio = (rest[0], -terms[rest[0]] / terms[first]) if rest else (-1, 0.0)
+            equated.append((first, np.array([other, model.eq_data[k, 0] / terms[first], ratio, 0, 0, 0])))
+    return equated
+
+
+def _tendon_terms(model: Any, k: int) -> dict[int, float]:
+    """Return joint → ``c`` for an equality ``Σ c (q − q⁰) = a₀`` of tendons with one or two joints, or nothing."""
+    mujoco, terms = import_mujoco(), dict[int, float]()
+    curved = model.eq_obj2id[k] >= 0 and model.eq_data[k, 2:5].any()
+    if curved or not model.eq_type[k] == mujoco.mjtEq.mjEQ_TENDON:
+        return {}
+    for tendon, scale in ((model.eq_obj1id[k], 1.0), (model.eq_obj2id[k], -model.eq_data[k, 1])):
+        for w in range(model.tendon_adr[tendon], model.tendon_adr[tendon] + model.tendon_num[tendon] * (tendon >= 0)):
+            if not model.wrap_type[w] == mujoco.mjtWrap.mjWRAP_JOINT:
+                return {}
+            j = int(model.wrap_objid[w])
+            terms[j] = terms.get(j, 0.0) + scale * float(model.wrap_prm[w])
+    terms = {j: c for j, c in terms.items() if c}
+    return terms if len(terms) < 3 else {}
 
 
 def _couplings(model: Any, path: Path) -> tuple[JointCoupling, ...]:
@@ -212,9 +235,11 @@ def _couplings(model: Any, path: Path) -> tuple[JointCoupling, ...]:
             offset = start + constant - ratio * model.qpos0[model.jnt_qposadr[other]]
             couplings[name] = JointCoupling(name, object_name(model, "joint", other), float(ratio), float(offset))
     for k in np.flatnonzero(model.eq_active0 & (model.eq_type != mujoco.mjtEq.mjEQ_JOINT)):
+        if _tendon_terms(model, int(k)):
+            continue
         kind = mujoco.mjtEq(int(model.eq_type[k])).name.removeprefix("mjEQ_").lower()
         name = object_name(model, "equality", int(k))
-        what = "couples joints by tendons" if kind == "tendon" else "closes a kinematic loop"
+        what = "couples more than two joints" if kind == "tendon" else "closes a kinematic loop"
         hint = "if it hardly matters, remove it in a copy of the file and `lock` the joints that it guides"
         raise MjcfError(f"equality '{name}' ({kind}) {what}, which is not supported", where=str(path), hint=hint)
     for name in _coupling_armatures(model):

@@ -222,12 +222,39 @@ def _with(text: str, **parts: str) -> str:
 _TENDON = '<fixed name="cord"{}><joint joint="shoulder" coef="1"/><joint joint="elbow" coef="1"/></fixed>'
 
 
+_THREE = _TENDON.format("").replace("</fixed>", '<joint joint="wrist" coef="1"/></fixed>')
+_OTHER = '<fixed name="other"><joint joint="elbow" coef="2"/><joint joint="wrist" coef="3"/></fixed>'
+
+
+@pytest.mark.parametrize(
+    ("equalities", "followers"),
+    [
+        ('<tendon tendon1="cord" polycoef=".2"/>', ["shoulder"]),
+        ('<tendon tendon1="cord"/><tendon tendon1="other" polycoef=".1"/>', ["shoulder", "elbow"]),
+        ('<joint joint1="shoulder" joint2="wrist"/><tendon tendon1="cord" polycoef=".1"/>', ["shoulder", "elbow"]),
+        ('<tendon tendon1="single" tendon2="other" polycoef=".1 -.5"/>', ["elbow"]),
+    ],
+)
+def test_equal_tendons_of_two_joints_are_couplings(tmp_path: Path, equalities: str, followers: list[str]) -> None:
+    single = '<fixed name="single"><joint joint="elbow" coef="4"/></fixed>'
+    text = _with(ARM, tendon=_TENDON.format("") + _OTHER + single, equality=equalities)
+    robot, model = loaded(tmp_path, text), own(text)
+    assert [coupling.follower for coupling in robot.couplings] == followers
+    q, data = robot.coupled(np.array([0.7, -0.3, 0.2, 0.05])), mujoco.MjData(model)
+    data.qpos[:] = q
+    mujoco.mj_forward(model, data)
+    assert data.ne == len(followers) and np.abs(data.efc_pos[: data.ne]).max() < 1e-12
+    data.qpos[:] += np.array([0.1, 0.2, 0.3, 0])
+    mujoco.mj_forward(model, data)
+    assert np.abs(data.efc_pos[: data.ne]).min() > 0.01
+
+
 @pytest.mark.parametrize(
     ("text", "line"),
     [
         (_with(ARM, equality='<connect name="rod" body1="hand" body2="base" anchor="0 0 0"/>'), "(connect) closes a"),
         (_with(ARM, equality='<weld body1="hand" body2="base"/>'), "'equality0' (weld) closes a kinematic loop"),
-        (_with(ARM, tendon=_TENDON.format(""), equality='<tendon tendon1="cord"/>'), "(tendon) couples joints by"),
+        (_with(ARM, tendon=_THREE, equality='<tendon tendon1="cord"/>'), "(tendon) couples more than two joints"),
         (_with(ARM, tendon=_TENDON.format(' armature="1"')), "the armature of tendon 'cord' couples joints"),
         (QUADRUPED.replace("</worldbody>", '<body name="ball"><freejoint/><geom size=".1"/></body></worldbody>')
          .replace("<key ", "<!--").replace('0 .5 .9 "/>', "-->"), "body 'ball' floats beside other joints"),
