@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import re
 import xml.etree.ElementTree as ET
@@ -19,11 +20,12 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.collision.shape_corners import Corrected, correct, mesh_points
+from impact_posture.collision.shape_corners import Corrected, correct, mesh_points, mesh_triangles, triangle_mesh
 from impact_posture.errors import UrdfError, one_line
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import locate
 from impact_posture.robot.urdf import parse_urdf, quiet_stderr
+from impact_posture.system.arrays import Array
 
 # A shape larger than 5 m and larger than ten times the robot is not in meters.
 _LARGEST = 5.0
@@ -132,9 +134,14 @@ class UrdfShape:
 
     def _load_mesh(self, largest: float) -> Corrected:
         try:
+            scale = self.unit * np.array(self.sizes)
             with quiet_stderr():
                 # Use a new loader every time, because a loader keeps all meshes in memory.
-                shape = coal.MeshLoader().load(str(self.mesh), self.unit * np.array(self.sizes))
+                shape = coal.MeshLoader().load(str(self.mesh), scale)
+            root = _root_transform(self.mesh)
+            if root is not None:
+                moved = (mesh_points(shape) / scale) @ root[:3, :3].T + root[:3, 3]
+                shape = triangle_mesh(moved * scale, mesh_triangles(shape))
         except Exception:  # The mesh library assimp may raise any exception.
             raise UnusableShape(f"{self.mesh} cannot be read as a mesh, or is empty; export it again") from None
         points = mesh_points(shape)
@@ -200,6 +207,28 @@ def _head(mesh: Path) -> bytes:
             return archive.open(models[0]).read(_HEAD) if models else b""
     with mesh.open("rb") as file:
         return file.read(_HEAD)
+
+
+def _root_transform(mesh: Path | None) -> Array | None:
+    """Return the transform of the single root node of a glTF file, shape (4, 4), which coal leaves out."""
+    if mesh is None or mesh.suffix.lower() not in (".gltf", ".glb"):
+        return None
+    data = mesh.read_bytes()
+    text = data[20 : 20 + int.from_bytes(data[12:16], "little")] if data.startswith(b"glTF") else data
+    content = json.loads(text)
+    roots = [
+        content["nodes"][k] for scene in content["scenes"][content.get("scene", 0) :][:1] for k in scene["nodes"]
+    ]
+    root = roots[0] if len(roots) == 1 else {}
+    if "mesh" in root or not {"matrix", "rotation", "scale", "translation"} & root.keys():
+        return None
+    if "matrix" in root:
+        return np.array(root["matrix"], dtype=float).reshape(4, 4).T
+    transform = np.eye(4)
+    rotation = pin.Quaternion(np.array(root.get("rotation", [0.0, 0.0, 0.0, 1.0]), dtype=float)).normalized()
+    transform[:3, :3] = rotation.matrix() * root.get("scale", [1.0, 1.0, 1.0])
+    transform[:3, 3] = root.get("translation", [0.0, 0.0, 0.0])
+    return transform
 
 
 def left_out(name: str, fault: UnusableShape) -> str:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import base64
+import json
+import struct
 import zipfile
 from pathlib import Path
 
@@ -72,6 +75,35 @@ def write_3mf(path: Path, unit: str) -> None:
             archive.writestr(name, f'<?xml version="1.0"?>{text}')
 
 
+def write_gltf(path: Path, root: dict[str, object]) -> None:
+    """Write the box as a child of a root node; the suffix chooses the text or the binary form."""
+    data = np.array(CORNERS, "<f4").tobytes() + np.array(FACES, "<u2").tobytes()
+    content = {
+        "asset": {"version": "2.0"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"children": [1], **root}, {"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+        "buffers": [{"byteLength": len(data)}],
+        "bufferViews": [
+            {"buffer": 0, "byteLength": 96},
+            {"buffer": 0, "byteOffset": 96, "byteLength": len(data) - 96},
+        ],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 8, "type": "VEC3", "min": [0, 0, 0], "max": [1, 2, 3]},
+            {"bufferView": 1, "componentType": 5123, "count": 36, "type": "SCALAR"},
+        ],
+    }
+    if path.suffix == ".gltf":
+        content["buffers"][0]["uri"] = "data:application/octet-stream;base64," + base64.b64encode(data).decode()
+        path.write_text(json.dumps(content))
+        return
+    text = json.dumps(content).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(data), b"BIN\0") + data
+    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+
+
 def extents(folder: Path, mesh: str, scale: str = "") -> tuple[Array, tuple[str, ...]]:
     """Return the edge lengths of a mesh as a collision shape, m, and the warnings; the drawn mesh has to agree."""
     described = f'<geometry><mesh filename="{mesh}"{scale}/></geometry>'
@@ -127,6 +159,26 @@ def test_the_units_of_other_formats_apply(tmp_path: Path, unit: str, factor: flo
         edges, warnings = extents(tmp_path, name)
         np.testing.assert_allclose(edges, factor * np.array([1, 2, 3]), rtol=1e-6)
         assert not warnings
+
+
+@pytest.mark.parametrize("name", ["box.gltf", "box.glb"])
+@pytest.mark.parametrize(
+    ("root", "size"),
+    [
+        ({}, (1, 2, 3)),
+        ({"rotation": [0.7071068, 0, 0, 0.7071068]}, (1, 3, 2)),
+        ({"rotation": [0, 0, 0.7071068, 0.7071068], "scale": [1, 2, 0.1], "translation": [9, 0, 0]}, (4, 1, 0.3)),
+        ({"matrix": [0, 0.1, 0, 0, 0.1, 0, 0, 0, 0, 0, 0.1, 0, 5, 0, 0, 1]}, (0.2, 0.1, 0.3)),
+    ],
+)
+def test_the_root_of_a_gltf_file_applies(
+    tmp_path: Path, name: str, root: dict[str, object], size: tuple[float, ...]
+) -> None:
+    """coal leaves out the transform of the root node, which exporters use to turn y up into z up."""
+    write_gltf(tmp_path / name, root)
+    edges, warnings = extents(tmp_path, name, ' scale="0.1 -0.1 0.2"')
+    np.testing.assert_allclose(edges, np.array(size) * [0.1, 0.1, 0.2], rtol=1e-5)
+    assert not warnings
 
 
 @pytest.mark.parametrize(
