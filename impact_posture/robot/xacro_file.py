@@ -10,17 +10,19 @@ import io
 import os
 import sys
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import redirect_stderr, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stderr, suppress
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from unittest.mock import patch
 from urllib.parse import quote
 
 from impact_posture.errors import InputError, PackageNotFound, UrdfError, nearest
 from impact_posture.system.libraries import cache_folder
 from impact_posture.system.optional_package import import_extra
+
+# Module of ROS from which xacro gets the folder of a package.
+_INDEX = "ament_index_python.packages"
 
 
 class _Arguments(dict[str, str]):
@@ -39,58 +41,63 @@ class _Arguments(dict[str, str]):
         return super().__getitem__(name)
 
 
+class _Packages:
+    """Folders of packages; ``known`` has those that are not below the ``folders`` or above the file ``path``."""
+
+    def __init__(self, path: Path, folders: Sequence[Path], known: Mapping[str, str]) -> None:
+        self._path, self._places, self._known = path, [*folders, *path.absolute().parents], known
+        self._ros: ModuleType | None = None
+        with suppress(ImportError):
+            self._ros = import_module(_INDEX)
+
+    def find(self, package: str) -> str:
+        """Return the folder of a package; raise ``PackageNotFound`` for an unknown package."""
+        if package in self._known:
+            return self._known[package]
+        for place in self._places:
+            if (place / package).is_dir():
+                return str(place / package)
+        with suppress(LookupError):  # ROS raises this error for an unknown package.
+            if self._ros is not None:
+                return str(self._ros.get_package_share_directory(package))
+        near = sorted(entry.name for place in self._places[:3] if place.is_dir() for entry in place.iterdir())
+        hint = "name the folder above it with `package_dir`"
+        raise PackageNotFound(package, near, where=str(self._path), hint=hint)
+
+    @contextmanager
+    def indexed(self) -> Iterator[None]:
+        """Answer in place of ROS when xacro asks for the folder of a package."""
+        index, names = ModuleType(_INDEX), (_INDEX.partition(".")[0], _INDEX)
+        index.get_package_share_directory = self.find  # type: ignore[attr-defined]
+        before = {name: sys.modules.get(name) for name in names}
+        sys.modules.update(dict.fromkeys(names, index))
+        try:
+            yield
+        finally:
+            for name, module in before.items():
+                if module is None:
+                    del sys.modules[name]
+                else:
+                    sys.modules[name] = module
+
+
 def expand_xacro(
-    path: Path, arguments: Mapping[str, str], folders: Sequence[Path], packages: Mapping[str, str] | None = None
+    path: Path, arguments: Mapping[str, str], folders: Sequence[Path], packages: Mapping[str, str]
 ) -> Path:
     """Expand a xacro file, and return the path of the URDF in the cache.
 
     ``arguments`` replace the defaults of ``<xacro:arg>``.  A package in ``$(find PACKAGE)`` and in ``package://``
     paths is in ``packages``, or has this name in one of the ``folders`` or in a folder above the file, or is a
-    package of ROS.  Relative paths of meshes start from the folder of the xacro file, or from
-    the folder above it, where expanded files often are.
+    package of ROS.  Relative paths of meshes start from the folder of the xacro file, or from the folder above it,
+    where expanded files often are.
 
     Raises:
         UrdfError: The file cannot be expanded.
         PackageNotFound: A package does not exist.
         InputError: xacro is not installed, or the file has no argument of this name.
     """
-    xacro = import_extra("xacro", "robots")
-    places = [*folders, *path.absolute().parents]
-    ros: ModuleType | None = None
-    with suppress(ImportError):
-        ros = import_module("ament_index_python.packages")
-
-    def find(package: str) -> str:
-        if package in (packages or {}):
-            return str((packages or {})[package])
-        for place in places:
-            if (place / package).is_dir():
-                return str(place / package)
-        with suppress(LookupError):  # ROS raises this error for an unknown package.
-            if ros is not None:
-                return str(ros.get_package_share_directory(package))
-        siblings = sorted(entry.name for place in places[:3] if place.is_dir() for entry in place.iterdir())
-        hint = "name the folder above it with `package_dir`"
-        raise PackageNotFound(package, siblings, where=str(path), hint=hint)
-
-    values = _Arguments(arguments)
-    try:
-        # xacro asks this module of ROS for packages, and prints the place of an error.
-        with patch.dict(sys.modules, _index(find)), redirect_stderr(io.StringIO()):
-            text = xacro.process_file(str(path), mappings=values).toxml()
-        root = ET.fromstring(text)
-    except InputError:
-        raise
-    except OSError as error:
-        raise UrdfError.unreadable(path, error) from None
-    except Exception as error:  # Expressions raise any error, and xacro wraps the errors of this function.
-        inner = error
-        while isinstance(inner, xacro.XacroException) and isinstance(inner.exc, Exception):
-            inner = inner.exc
-        if isinstance(inner, InputError):
-            raise inner from None
-        fault = f"cannot be expanded ({error or type(error).__name__})"
-        raise UrdfError(fault, where=str(path), hint="correct it, or give its arguments by `xacro_arg`") from None
+    values, index = _Arguments(arguments), _Packages(path, folders, packages)
+    root = _expanded(path, values, index)
     unknown = next((name for name in arguments if name not in values.known), None)
     if unknown is not None:
         close = nearest(unknown, values.known, 1)
@@ -100,7 +107,7 @@ def expand_xacro(
         hint = "name the file that uses its macros"
         raise UrdfError("expands to a robot without links", where=str(path), hint=hint)
     for mesh in root.iter("mesh"):
-        mesh.set("filename", _absolute(mesh.get("filename", ""), path.absolute().parents[:2], find))
+        mesh.set("filename", _absolute(mesh.get("filename", ""), path.absolute().parents[:2], index))
     content = ET.tostring(root)
     name = path.name.removesuffix(".xacro").removesuffix(".urdf") + ".urdf"
     urdf = cache_folder("xacro", hashlib.sha256(content).hexdigest()[:16]) / name
@@ -111,14 +118,24 @@ def expand_xacro(
     return urdf
 
 
-def _index(find: Callable[[str], str]) -> dict[str, ModuleType]:
-    """Return the modules of ROS from which xacro gets the folder of a package."""
-    parent, packages = ModuleType("ament_index_python"), ModuleType("ament_index_python.packages")
-    packages.get_package_share_directory = find  # type: ignore[attr-defined]
-    return {module.__name__: module for module in (parent, packages)}
+def _expanded(path: Path, values: _Arguments, packages: _Packages) -> ET.Element:
+    xacro = import_extra("xacro", "robots")
+    try:
+        with packages.indexed(), redirect_stderr(io.StringIO()):  # xacro prints the place of an error.
+            return ET.fromstring(xacro.process_file(str(path), mappings=values).toxml())
+    except Exception as error:  # Expressions raise any error.
+        cause = error
+        while isinstance(cause, xacro.XacroException) and isinstance(cause.exc, Exception):
+            cause = cause.exc
+        if isinstance(cause, InputError):
+            raise cause from None
+        if isinstance(cause, OSError):
+            raise UrdfError.unreadable(Path(cause.filename or path), cause) from None
+        fault = f"cannot be expanded ({error or type(error).__name__})"
+        raise UrdfError(fault, where=str(path), hint="correct it, or give its arguments by `xacro_arg`") from None
 
 
-def _absolute(text: str, folders: Sequence[Path], find: Callable[[str], str]) -> str:
+def _absolute(text: str, folders: Sequence[Path], packages: _Packages) -> str:
     """Return the path of a mesh as a ``file://`` URI; keep ``package://`` paths of packages that do not exist."""
     scheme, colon, rest = text.partition("://")
     if not colon:
@@ -127,5 +144,5 @@ def _absolute(text: str, folders: Sequence[Path], find: Callable[[str], str]) ->
     package, _, inside = rest.partition("/")
     with suppress(PackageNotFound):
         if scheme == "package":
-            return f"file://{quote(str(Path(find(package), inside)))}"
+            return f"file://{quote(str(Path(packages.find(package), inside)))}"
     return text

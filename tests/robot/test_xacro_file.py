@@ -6,6 +6,7 @@ import shutil
 import sys
 import tomllib
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -115,6 +116,32 @@ def test_faults(arm: str, old: str, new: str, line: str, capfd: pytest.CaptureFi
     with pytest.raises(UrdfError if "arm_desc" not in line else PackageNotFound) as error:
         load_robot(arm, xacro_arg={"hand": "true"})
     assert line in error.value.line and capfd.readouterr() == ("", "")
+
+
+def test_missing_files(arm: str) -> None:
+    with pytest.raises(UrdfError, match=r"gone\.xacro: no such file"):
+        load_robot(str(Path(arm).parent / "gone.xacro"))
+    Path(arm).write_text(Path(arm).read_text().replace("/link.xacro", "/gone.xacro"))
+    with pytest.raises(UrdfError, match=r"gone\.xacro"):
+        load_robot(arm)
+
+
+def test_packages_of_ros(arm: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def share(package: str) -> str:
+        if package == "vendor_description":
+            return str(Path(arm).parents[1])
+        raise LookupError(package)
+
+    index = ModuleType("ament_index_python.packages")
+    index.get_package_share_directory = share  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "ament_index_python", index)
+    monkeypatch.setitem(sys.modules, "ament_index_python.packages", index)
+    Path(arm).write_text(ARM.replace("arm_description", "vendor_description"))
+    assert load_robot(arm, xacro_arg={"hand": "true"}).nv == 2
+    assert sys.modules["ament_index_python.packages"] is index
+    Path(arm).write_text(ARM.replace("arm_description", "other_description"))
+    with pytest.raises(PackageNotFound, match="no path 'other_description'"):
+        load_robot(arm)
 
 
 def test_unknown_arguments(arm: str) -> None:
