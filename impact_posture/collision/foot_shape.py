@@ -33,21 +33,25 @@ def support(robot: Robot, frame: str, *, flat: bool) -> Support:
     """
     foot = Support(frame=frame, kind="surface" if flat else "point")
     sole = _lowest(robot, frame, np.array([0.0, 0.0, 1.0]))
-    up = upright_frames(robot).oMf[robot.frame_id(frame)].rotation[2]
     if not len(sole):
         return foot
     middle = (sole.min(axis=0) + sole.max(axis=0)) / 2
-    flat_foot = measured_sole(robot, replace(foot, kind="surface", offset=_rounded(middle)))
-    if flat_foot.has_sole and up[2] > _UPRIGHT:
-        return flat_foot
-    return replace(foot, offset=_rounded(_lowest(robot, frame, up).mean(axis=0)))
+    measured = measured_sole(robot, replace(foot, kind="surface", offset=_rounded(middle)))
+    lowest = _lowest(robot, frame, _up(robot, frame)).mean(axis=0)
+    return measured if measured.has_sole else replace(foot, offset=_rounded(lowest))
 
 
 def measured_sole(robot: Robot, foot: Support) -> Support:
-    """Return a foot with the size of its sole around its contact point; unchanged if it is not flat below."""
+    """Return a foot with the size of its sole around its contact point; unchanged if it is not flat and below."""
     sole = _lowest(robot, foot.frame, np.array([0.0, 0.0, 1.0]))
     x, y, _ = _rounded(np.append(_inner_rectangle(sole[:, :2] - foot.offset[:2]), 0.0))
-    return replace(foot, size=(x, y)) if min(x, y) >= _SOLE / 2 else foot
+    upright = _up(robot, foot.frame)[2] > _UPRIGHT
+    return replace(foot, size=(x, y)) if upright and min(x, y) >= _SOLE / 2 else foot
+
+
+def _up(robot: Robot, frame: str) -> Array:
+    """Return the upward direction at the default posture, in the axes of a frame, shape (3,)."""
+    return np.asarray(upright_frames(robot).oMf[robot.frame_id(frame)].rotation[2])
 
 
 def _rounded(point: Array) -> Vector3:

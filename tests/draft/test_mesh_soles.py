@@ -115,6 +115,17 @@ def test_a_surface_without_size_is_measured(tmp_path: Path) -> None:
     assert resolve_supports(stated, None)[0].offset == (0.0, 0.0, 0.0)
 
 
+def test_the_upper_side_of_a_foot_is_not_a_sole(tmp_path: Path) -> None:
+    turned = "".join(
+        f'<link name="{side}_tip"/><joint name="to_{side}_tip" type="fixed"><parent link="{side}_foot"/>'
+        f'<child link="{side}_tip"/><origin xyz="0.02 0 -0.06" rpy="{np.pi} 0 0"/></joint>'
+        for side in ("left", "right")
+    )
+    (tmp_path / "biped.urdf").write_text(biped(BOX).replace("</robot>", f"{turned}</robot>"))
+    robot = load_robot(str(tmp_path / "biped.urdf"), root="free-flyer")
+    assert not any(s.has_sole for s in resolve_supports(robot, ["left_tip:surface", "right_tip:surface"]))
+
+
 def test_a_surface_without_size_and_shape_bears_no_moment(tmp_path: Path) -> None:
     """Two feet that bear no moment cannot balance the robot, so a warning says where its center of mass is."""
     case = prepared(tmp_path, "", foot="", com=False)
