@@ -109,7 +109,7 @@ study-elastic: $(VENV)/.installed-test
 
 study-global: $(VENV)/.installed-test
 	$(BIN)/python -m docs.studies global --write
-	$(BIN)/python -m docs.studies search
+	$(BIN)/python -m docs.studies search --seed 1
 
 study-feasible: $(VENV)/.installed-test
 	$(BIN)/python -m docs.studies feasible --write

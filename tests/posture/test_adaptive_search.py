@@ -85,11 +85,11 @@ def test_the_merit_has_the_gradient_of_finite_differences() -> None:
     problem = prepare(make_settings({"robot": "solo12", "normal": (1, 0, 0), "com": True})).problem
     manifold, size = ConstraintManifold(problem), 1e-6
     x = postures(manifold, 4)
-    gradient = manifold.merit(x)[1]
+    gradient = manifold.evaluate(x).gradient
     for k in range(manifold.chart.nv):
         step = np.zeros((4, manifold.chart.nv))
         step[:, k] = size
-        ahead, behind = manifold.merit(manifold.move(x, step))[0], manifold.merit(manifold.move(x, -step))[0]
+        ahead, behind = (manifold.evaluate(manifold.move(x, sign * step)).merit for sign in (1, -1))
         np.testing.assert_allclose(gradient[:, k], (ahead - behind) / (2 * size), rtol=1e-4, atol=1e-4)
 
 
@@ -103,8 +103,8 @@ def test_descents_end_near_optima_on_the_constraints(number: int) -> None:
     assert len(ends.x) >= len(before) / 2
     assert np.abs(manifold.equalities(ends.x)[0]).max() < 1e-4
     assert (ends.x >= problem.lower - 1e-12).all() and (ends.x <= problem.upper + 1e-12).all()
-    assert (ends.merit <= manifold.merit(before)[0][ends.tag] + 1e-9).all()
-    assert np.median(manifold.merit(before)[0]) - np.median(ends.merit) > 0.5
+    assert (ends.merit <= manifold.evaluate(before).merit[ends.tag] + 1e-9).all()
+    assert np.median(manifold.evaluate(before).merit) - np.median(ends.merit) > 0.5
     # From most ends, a second descent cannot lower the merit by 1 %, and the best end is certified nearby.
     again = descended(manifold, ends.x)
     assert np.mean(ends.merit[again.tag] - again.merit < 0.01) > 0.8
@@ -132,7 +132,7 @@ def test_a_joint_that_is_held_does_not_move() -> None:
 
 
 def test_the_adaptive_search_reaches_what_sixteen_starts_miss() -> None:
-    problem = random_arm(1)
+    problem = random_arm(5)
     many = solve(problem, starts=200, seed=9, jobs=1, compile="never").optima[0].objective
     few = solve(problem, jobs=1, compile="never")
     adaptive = solve(problem, screened=1024, jobs=1, compile="never")
@@ -141,6 +141,15 @@ def test_the_adaptive_search_reaches_what_sixteen_starts_miss() -> None:
     assert adaptive.estimate.method == "adaptive" and adaptive.estimate.hits_of_best >= 3
     # The search stopped long before its limit.
     assert adaptive.estimate.starts + adaptive.estimate.hops < 700
+
+
+def test_hops_reach_what_random_postures_miss(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = random_arm(3)
+    hops = solve(problem, screened=1024, jobs=1, compile="never")
+    monkeypatch.setattr(screening_module, "_HOPPING", 0.0)
+    random = solve(problem, screened=1024, jobs=1, compile="never")
+    assert hops.estimate.hops > 300 and random.estimate.hops == 0
+    assert hops.optima[0].objective < 0.8 * random.optima[0].objective
 
 
 def test_one_seed_gives_one_answer() -> None:

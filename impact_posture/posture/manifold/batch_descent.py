@@ -1,9 +1,11 @@
 """Descend from many postures at once, on the equalities of a problem and within its joint limits.
 
-Each posture takes quasi-Newton steps (BFGS) in the tangent space of the equalities.  After each step, Gauss–Newton
-steps return it to the equalities.  The batch stays full, because a new descent can begin when another ends.  For an
-arm, a descent takes about 1 ms, and a run of IPOPT about 10 ms.  Clearances and loads have no batch function, so
-descents ignore them.
+Each step is the sum of a quasi-Newton step (BFGS) in the tangent space of the equalities and of a Gauss–Newton step
+that returns to the equalities.  The Lagrangian ``m − λᵀc`` judges postures off the equalities, with the merit m, the
+equalities c and the least-squares multipliers λ.  To first order, it is the merit after the return, so a step needs a
+single evaluation.  The batch stays full, because a new descent can begin when another ends.  For an arm, a descent
+takes about 0.5 ms, and a run of IPOPT about 10 ms.  Clearances and loads have no batch function, so descents ignore
+them.
 """
 
 from __future__ import annotations
@@ -17,12 +19,13 @@ from numpy.typing import NDArray
 from impact_posture.posture.manifold.constraint_manifold import ConstraintManifold, right_inverse, times
 from impact_posture.system.arrays import Array
 
-# Residual (m, rad) below which a posture satisfies the equalities, and the residual up to which a step is accepted.
-_SATISFIED, _DRIFT = 1e-6, 1e-4
-# Number of Gauss–Newton steps from a drawn posture, and after a step of a descent.
+# Residual (m, rad) below which a posture satisfies the equalities, the residual of a descent that may end, and the
+# largest residual of an accepted step.
+_SATISFIED, _NEAR, _DRIFT = 1e-6, 1e-3, 0.1
+# Number of Gauss–Newton steps from a drawn posture, and from the last posture of a descent.
 _PROJECTING, _RETURNING = 15, 2
-# Longest step (rad, m), and the step below which a descent cannot continue.
-_LONGEST, _SHORTEST = 0.6, 1e-6
+# First and largest trust radius (rad, m), and the radius below which a descent gives up.
+_FIRST, _LONGEST, _SHORTEST = 0.3, 0.6, 1e-6
 # Share of the predicted decrease that a step must reach, and the factor that shortens a rejected step.
 _SUFFICIENT, _SHORTER = 1e-4, 0.3
 # A descent ends if the next step would lower the merit by less than this, or after this number of steps.
@@ -34,12 +37,8 @@ _CURVED, _DOWNHILL = 1e-3, 1e-2
 
 
 @dataclass
-class Ends:
-    """Postures where descents ended, shape (N, nx), with the merit and the tag of each."""
-
-    x: Array
-    merit: Array
-    tag: NDArray[np.int_]
+class _Rows:
+    """Arrays with a row for each posture."""
 
     def taken(self, rows: NDArray[np.bool_]) -> Self:
         """Return the rows of a mask."""
@@ -52,27 +51,54 @@ class Ends:
 
 
 @dataclass
-class _State(Ends):
-    """Descents under way: one row for each.
+class Ends(_Rows):
+    """Postures where descents ended, shape (N, nx), with the merit and the tag of each."""
+
+    x: Array
+    merit: Array
+    tag: NDArray[np.int_]
+
+
+@dataclass
+class _Points(_Rows):
+    """Postures, and what a step from each needs.
 
     Attributes:
         x: Postures, shape (N, nx).
-        merit: Value of :meth:`ConstraintManifold.merit`, shape (N,).
-        tag: Integer that the caller gave to the posture, shape (N,).
-        gradient: Gradient of the merit along the manifold and the limits, shape (N, nv).
+        merit: Lagrangian ``m − λᵀc``, shape (N,).
+        gradient: Gradient along the equalities and the active limits, shape (N, nv).
+        tangent: Projection of tangent vectors onto the equalities and the active limits, shape (N, nv, nv).
+        back: Gauss–Newton step to the equalities, shape (N, nv).
+        residual: Largest violation of an equality, shape (N,).
+    """
+
+    x: Array
+    merit: Array
+    gradient: Array
+    tangent: Array
+    back: Array
+    residual: Array
+
+
+@dataclass
+class _State(_Points):
+    """Descents under way: one row for each.
+
+    Attributes:
         direction: Direction of the next step, shape (N, nv).
         hessian: Estimated inverse Hessian, shape (N, nv, nv).
         fresh: Whether the Hessian is the identity matrix, shape (N,).
-        length: Share of the direction to try, shape (N,).
+        radius: Trust radius, shape (N,).
         age: Number of steps, shape (N,).
+        tag: Integer that the caller gave to the posture, shape (N,).
     """
 
-    gradient: Array
     direction: Array
     hessian: Array
     fresh: NDArray[np.bool_]
-    length: Array
+    radius: Array
     age: NDArray[np.int_]
+    tag: NDArray[np.int_]
 
 
 class BatchDescent:
@@ -93,77 +119,72 @@ class BatchDescent:
         Return the number of descents that began.
         """
         projected = self.manifold.project(x, _PROJECTING, within=True, tolerance=_SATISFIED)
-        begun = self._begin(projected.x[projected.converged], tag[projected.converged])
+        on = projected.residual <= _NEAR
+        begun = self._begin(projected.x[on], tag[on])
         begun = begun.taken(np.isfinite(begun.merit))
         self._state = self._state.joined(begun)
         return len(begun.x)
 
     def step(self) -> Ends:
-        """Take a step in each descent, and return the descents that ended."""
+        """Take a step in each descent, and return the descents that ended on the equalities."""
         s, manifold = self._state, self.manifold
         s.age += 1
         size = np.linalg.norm(s.direction, axis=1)
-        length = np.minimum(s.length, _LONGEST / np.maximum(size, 1e-300))
-        moved = length[:, None] * s.direction
-        to = manifold.project(manifold.move(s.x, moved), _RETURNING, within=True, tolerance=_SATISFIED)
-        merit, gradient = manifold.merit(to.x)
+        length = np.minimum(1.0, s.radius / np.maximum(size, 1e-300))
+        along = length[:, None] * s.direction
+        point = self._points(np.clip(manifold.move(s.x, along + s.back), manifold.lower, manifold.upper))
         bound = s.merit + _SUFFICIENT * length * (s.direction * s.gradient).sum(axis=1)
-        accepted = np.isfinite(merit) & (to.residual <= _DRIFT) & (merit <= bound)
-        s.length = np.where(accepted, 1.0, length * _SHORTER)
-        stuck = ~accepted & (length * size < _SHORTEST)
-        if accepted.any():
-            self._accept(accepted, to.x, merit, gradient, to.jacobian, moved)
+        # A posture whose residual is too large for the first order may first return.
+        returned = (s.residual > _NEAR) & (point.residual < s.residual / 2)
+        accepted = np.isfinite(point.merit) & (point.residual <= _DRIFT) & ((point.merit <= bound) | returned)
+        grown = np.where(length < 1, np.minimum(2 * s.radius, _LONGEST), s.radius)
+        s.radius = np.where(accepted, grown, _SHORTER * length * size)
+        # A rejected step also says how the gradient changes.
+        change = np.where(np.isfinite(point.merit)[:, None], point.gradient - s.gradient, 0.0)
+        s.hessian, s.fresh = _updated(s.hessian, s.fresh, along, change)
+        for field in fields(point):
+            getattr(s, field.name)[accepted] = getattr(point, field.name)[accepted]
+        self._turn()
         decrease = -(s.direction * s.gradient).sum(axis=1)
-        ended = (decrease < _CONVERGED) | stuck | (s.age >= _STEPS)
-        self._state = s.taken(~ended)
-        return Ends(s.x[ended], s.merit[ended], s.tag[ended])
+        ended = ((decrease < _CONVERGED) & (s.residual <= _NEAR)) | (s.radius < _SHORTEST) | (s.age >= _STEPS)
+        self._state, ends = s.taken(~ended), s.taken(ended)
+        at = manifold.project(ends.x, _RETURNING, within=True, tolerance=_SATISFIED)
+        return Ends(at.x, ends.merit, ends.tag).taken((ends.residual <= _NEAR) & at.converged)
 
     def _begin(self, x: Array, tag: NDArray[np.int_]) -> _State:
-        merit, gradient = self.manifold.merit(x)
-        along = _Along(self.manifold, x, self.manifold.equalities(x)[1], gradient).gradient
-        count, nv = gradient.shape
+        point, count, nv = self._points(x), len(x), self.manifold.chart.nv
         hessian = np.broadcast_to(np.eye(nv), (count, nv, nv)).copy()
-        ones = np.ones(count)
-        return _State(x, merit, tag, along, -along, hessian, ones > 0, ones, np.zeros(count, dtype=int))
+        radius, age = np.full(count, _FIRST), np.zeros(count, dtype=int)
+        new = {"direction": -point.gradient, "hessian": hessian, "fresh": radius > 0, "radius": radius, "age": age}
+        return _State(**vars(point), **new, tag=tag)
 
-    def _accept(
-        self, rows: NDArray[np.bool_], x: Array, merit: Array, gradient: Array, jacobian: Array, moved: Array
-    ) -> None:
-        """Move the descents of a mask to their new postures, and choose their next directions."""
-        s, identity = self._state, np.eye(self.manifold.chart.nv)
-        along = _Along(self.manifold, x[rows], jacobian[rows], gradient[rows])
-        hessian, fresh = _updated(s.hessian[rows], s.fresh[rows], moved[rows], along.gradient - s.gradient[rows])
-        direction = along.project(-times(hessian, along.gradient))
-        slope = (direction * along.gradient).sum(axis=1)
-        sizes = np.linalg.norm(direction, axis=1) * np.linalg.norm(along.gradient, axis=1)
-        uphill = slope > -_DOWNHILL * sizes
-        hessian[uphill], fresh = identity, fresh | uphill
-        direction = np.where(uphill[:, None], -along.gradient, direction)
-        s.x[rows], s.merit[rows], s.gradient[rows] = x[rows], merit[rows], along.gradient
-        s.hessian[rows], s.fresh[rows], s.direction[rows] = hessian, fresh, direction
-
-
-class _Along:
-    """Tangent vectors along the equalities and the active joint limits; ``gradient`` is the projected gradient."""
-
-    def __init__(self, manifold: ConstraintManifold, x: Array, jacobian: Array, gradient: Array) -> None:
-        free = np.ones(gradient.shape, dtype=bool)
+    def _points(self, x: Array) -> _Points:
+        at = self.manifold.evaluate(x)
+        free = np.ones(at.gradient.shape, dtype=bool)
         for _ in range(_ACTIVE_SETS):
-            self._free = free
-            self._jacobian = np.where(self._free[:, None, :], jacobian, 0.0)
-            self._inverse = right_inverse(self._jacobian)
+            jacobian = np.where(free[:, None, :], at.jacobian, 0.0)
+            inverse = right_inverse(jacobian)
             # The gradient minus the forces of the equalities: at a limit, its sign says whether the limit is active.
-            multipliers = times(self._inverse.transpose(0, 2, 1), gradient)
-            rest = gradient - times(jacobian.transpose(0, 2, 1), multipliers)
-            self.gradient = np.where(self._free, rest, 0.0)
-            free = ~manifold.blocked(x, -rest)
-            if (free == self._free).all():
+            multipliers = times(inverse.transpose(0, 2, 1), at.gradient)
+            rest = at.gradient - times(at.jacobian.transpose(0, 2, 1), multipliers)
+            before, free = free, ~self.manifold.blocked(x, -rest)
+            if (free == before).all():
                 break
+        tangent = before[:, :, None] * np.eye(self.manifold.chart.nv) - inverse @ jacobian
+        back = self.manifold.back(x, at.equalities, jacobian, inverse)
+        residual = np.abs(at.equalities).max(axis=1, initial=0.0)
+        merit = at.merit - (multipliers * at.equalities).sum(axis=1)
+        return _Points(x, merit, np.where(before, rest, 0.0), tangent, back, residual)
 
-    def project(self, v: Array) -> Array:
-        """Return the parts of tangent vectors, shape (N, nv), along the equalities and limits."""
-        v = np.where(self._free, v, 0.0)
-        return np.asarray(v - times(self._inverse, times(self._jacobian, v)))
+    def _turn(self) -> None:
+        """Choose the next direction of each descent."""
+        s = self._state
+        s.direction = -times(s.tangent, times(s.hessian, s.gradient))
+        slope = (s.direction * s.gradient).sum(axis=1)
+        sizes = np.linalg.norm(s.direction, axis=1) * np.linalg.norm(s.gradient, axis=1)
+        uphill = slope > -_DOWNHILL * sizes
+        s.hessian[uphill], s.fresh = np.eye(self.manifold.chart.nv), s.fresh | uphill
+        s.direction[uphill] = -s.gradient[uphill]
 
 
 def _updated(hessian: Array, fresh: NDArray[np.bool_], step: Array, change: Array) -> tuple[Array, NDArray[np.bool_]]:

@@ -19,6 +19,7 @@ from impact_posture.dynamics.spatial import quaternion_matrix
 from impact_posture.dynamics.tree import Tree
 from impact_posture.posture.constraints.constraint import ExpressionConstraint
 from impact_posture.posture.manifold.batch_function import BatchFunction
+from impact_posture.posture.manifold.feasible_start import BASE_SPREAD, draw_ranges, near_steps
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem, held_rows
 from impact_posture.system.arrays import Array
 
@@ -28,6 +29,8 @@ _ROUNDING = 1e-13
 _LONGEST_STEP = 0.5
 # Weight of the squared violation of an inequality in the merit of a posture, 1/m² or 1/rad².
 _PENALTY = 200.0
+# Share of the random postures near a given posture.
+_NEAR = 0.25
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,24 @@ class Projected:
     residual: Array
     jacobian: Array
     converged: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class MeritEvaluation:
+    """Equalities and merit at postures.
+
+    Attributes:
+        equalities: Values ``c``, shape (N, m).
+        jacobian: Tangent Jacobian of the equalities, shape (N, m, nv).
+        merit: ``ln f + μ Σ e²``, shape (N,), with the objective ``f`` and the violations ``e`` of the inequalities
+            onto which postures are projected.  The value is not finite where the objective is not defined.
+        gradient: Tangent gradient of the merit, shape (N, nv).
+    """
+
+    equalities: Array
+    jacobian: Array
+    merit: Array
+    gradient: Array
 
 
 class ConstraintManifold:
@@ -69,10 +90,12 @@ class ConstraintManifold:
         equal = ca.vertcat(ca.SX(0, 1), *[c.symbolic(tree, ca.SX(ca.DM(c.parameters))) for c in equalities])
         self._inequalities = [c for c in problem.constraints if c not in equalities]
         jacobian = ca.vertcat(ca.jacobian(equal, x) @ motion, held)
-        self._equalities = BatchFunction([x], [ca.vertcat(equal, ca.SX(len(held), 1)), jacobian])
-        objective, normal = problem.impact.gradient_fun(), ca.DM(problem.impact.contact.normal)
-        self._objective = BatchFunction([x], list(objective(tree.q, normal)))
-        self._penalty = self._penalty_function(tree, motion, x)
+        rows = [ca.vertcat(equal, ca.SX(len(held), 1)), jacobian]
+        self._equalities = BatchFunction([x], rows)
+        objective = list(problem.impact.gradient_fun()(tree.q, ca.DM(problem.impact.contact.normal)))
+        self._objective = BatchFunction([x], objective)
+        penalty = self._penalty(tree)
+        self._all = BatchFunction([x], [*rows, *objective, penalty, motion.T @ ca.gradient(penalty, x)])
         self._moved = BatchFunction([x, v], [_normalized(self.chart, x + motion @ v)])
         self._turning = np.zeros(self.chart.nx, dtype=bool)
         self.lower, self.upper = problem.lower.copy(), problem.upper.copy()
@@ -95,21 +118,14 @@ class ConstraintManifold:
         value, gradient = self._objective(x)
         return value[:, 0, 0], gradient[:, :, 0]
 
-    def merit(self, x: Array) -> tuple[Array, Array]:
-        """Return ``ln f + μ Σ e²``, shape (N,), and its tangent gradient, shape (N, nv).
-
-        ``f`` is the objective, and ``e`` are the violations of the inequalities onto which postures are projected.
-        The value is not finite where the objective is not defined.
-        """
-        value, gradient = self.objective(x)
+    def evaluate(self, x: Array) -> MeritEvaluation:
+        """Evaluate equalities and merit, which share most operations."""
+        equalities, jacobian, objective, gradient, penalty, slope = self._all(x)
         with np.errstate(all="ignore"):
-            value, gradient = np.log(value), gradient / value[:, None]
-        if self._penalty is not None:
-            penalty, slope = self._penalty(x)
-            value, gradient = value + penalty[:, 0, 0], gradient + slope[:, :, 0]
-        return value, gradient
+            merit, gradient = np.log(objective[:, 0, 0]) + penalty[:, 0, 0], gradient / objective + slope
+        return MeritEvaluation(equalities[:, :, 0], jacobian, merit, gradient[:, :, 0])
 
-    def _penalty_function(self, tree: Tree, motion: ca.SX, x: ca.SX) -> BatchFunction | None:
+    def _penalty(self, tree: Tree) -> ca.SX:
         terms = ca.SX(0)
         for constraint in self._inequalities:
             if isinstance(constraint, ExpressionConstraint) and constraint.projected:
@@ -120,9 +136,7 @@ class ConstraintManifold:
                         continue
                     excess = ca.fmax(sign * (value[rows] - ca.DM(bounds[rows])), 0)
                     terms += _PENALTY * ca.dot(excess, excess)
-        if terms.is_zero():
-            return None
-        return BatchFunction([x], [terms, motion.T @ ca.gradient(terms, x)])
+        return terms
 
     def distance_to_feasible(self, x: Array) -> Array:
         """Return the first-order distance to the set that satisfies limits and inequalities, shape (N,)."""
@@ -135,6 +149,21 @@ class ConstraintManifold:
                 slopes = np.maximum(np.linalg.norm(jacobian, axis=1), 1e-9)
                 outside[k] = max(outside[k], float((np.abs(constraint.excess(value)) / slopes).max()))
         return np.asarray(outside)
+
+    def draw(self, rng: np.random.Generator, count: int, near: Array) -> Array:
+        """Draw postures, shape (N, nx), a quarter of them near the posture ``near``, shape (nq,).
+
+        The others lie anywhere within the limits.  All may violate the constraints.
+        """
+        ranges, base = draw_ranges(self.problem, self.chart), self.problem.robot.first_joint
+        x = np.tile(self.chart.to_x(self.problem.given), (count, 1))
+        x[:, ranges.entries] = rng.uniform(ranges.lower, ranges.upper, (count, len(ranges.entries)))
+        step = np.zeros((count, self.chart.nv))
+        step[:, :base] = rng.normal(size=(count, base)) * BASE_SPREAD[:base]
+        close = rng.random(count) < _NEAR
+        x[close] = self.chart.to_x(near)
+        step[close] = near_steps(rng, (int(close.sum()), self.chart.nv), base)
+        return self.move(x, step)
 
     def tangents(self, x: Array, dimension: int) -> Array:
         """Return an orthonormal basis of the tangent space of the manifold, shape (N, dimension, nv)."""
@@ -162,19 +191,27 @@ class ConstraintManifold:
             left = np.flatnonzero(residual > tolerance)
             if not left.size:
                 break
-            step = -times(right_inverse(jacobian[left]), value[left])
-            at_limit = self.blocked(x[left], step) if within else np.zeros(step.shape, dtype=bool)
-            again = np.flatnonzero(at_limit.any(axis=1))
-            if again.size:
-                free = np.where(at_limit[again, None, :], 0.0, jacobian[left[again]])
-                step[again] = -times(right_inverse(free), value[left[again]])
-            size = np.linalg.norm(step, axis=1, keepdims=True)
-            x[left] = self.move(x[left], step * np.minimum(1.0, _LONGEST_STEP / np.maximum(size, 1e-300)))
+            inverse = right_inverse(jacobian[left])
+            x[left] = self.move(x[left], self.back(x[left], value[left], jacobian[left], inverse, within=within))
             if within:
                 x[left] = np.clip(x[left], self.lower, self.upper)
             value[left], jacobian[left] = self.equalities(x[left])
             residual[left] = np.abs(value[left]).max(axis=1, initial=0.0)
         return Projected(x, residual, jacobian, residual <= tolerance)
+
+    def back(self, x: Array, value: Array, jacobian: Array, inverse: Array, *, within: bool = True) -> Array:
+        """Return the Gauss–Newton steps to the equalities, shape (N, nv), shortened to the longest step.
+
+        ``inverse`` is the right inverse of ``jacobian``.  With ``within``, joints at a limit do not leave it.
+        """
+        step = -times(inverse, value)
+        at_limit = self.blocked(x, step) if within else np.zeros(step.shape, dtype=bool)
+        again = np.flatnonzero(at_limit.any(axis=1))
+        if again.size:
+            free = np.where(at_limit[again, None, :], 0.0, jacobian[again])
+            step[again] = -times(right_inverse(free), value[again])
+        size = np.linalg.norm(step, axis=1, keepdims=True)
+        return np.asarray(step * np.minimum(1.0, _LONGEST_STEP / np.maximum(size, 1e-300)))
 
     def blocked(self, x: Array, direction: Array) -> NDArray[np.bool_]:
         """Return a mask, shape (N, nv), of the joints at a limit that the direction would violate."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -23,6 +24,8 @@ _STEPS = 80
 _PATIENCE = 16
 # Maximum number of projected postures among which one start is chosen.
 CANDIDATES = 3
+# Standard deviations of the base of a floating robot in random postures: position, m, and rotation, rad.
+BASE_SPREAD = np.array([0.15, 0.15, 0.15, 0.15, 0.15, 0.6])
 # Share of the trace that is added to the diagonal of a matrix that may be singular.
 _ROUNDING = 1e-13
 
@@ -187,21 +190,42 @@ def random_posture(
     model = problem.robot.model
     base = problem.robot.first_joint
     if near is not None:
-        step = rng.normal(size=model.nv) * rng.uniform(0.1, 0.8)
-        step[:base] *= 0.2
-        return np.asarray(pin.integrate(model, near, step))
-    x = chart.to_x(problem.given)
-    for slot in chart.slots:
-        low, high = problem.lower[slot.x], problem.upper[slot.x]
-        if slot.kind.family in ("revolute", "prismatic", "translation"):
-            span = np.pi if slot.kind.family == "revolute" else 1.0
-            low, high = np.where(np.isfinite(low), low, -span), np.where(np.isfinite(high), high, span)
-            x[slot.x] = rng.uniform(np.minimum(low, high), high)
-        elif slot.kind.family in ("continuous", "planar"):
-            x[slot.x.stop - 1] = rng.uniform(-np.pi, np.pi)
+        return np.asarray(pin.integrate(model, near, near_steps(rng, (model.nv,), base)))
+    x, ranges = chart.to_x(problem.given), draw_ranges(problem, chart)
+    x[ranges.entries] = rng.uniform(ranges.lower, ranges.upper)
     q = chart.to_q(x)
     if base:
         step = np.zeros(model.nv)
-        step[:base] = rng.normal(size=base) * np.array([0.15] * 3 + [0.15, 0.15, 0.6])
+        step[:base] = rng.normal(size=base) * BASE_SPREAD
         q = pin.integrate(model, q, step)
     return np.asarray(q)
+
+
+class DrawRanges(NamedTuple):
+    """Entries of the chart coordinates that are drawn within limits, and the limits, shape (k,) each."""
+
+    entries: NDArray[np.int_]
+    lower: Array
+    upper: Array
+
+
+def draw_ranges(problem: ConstrainedProblem, chart: Chart) -> DrawRanges:
+    """Return the ranges of random postures; a joint without limits gets a full turn or ±1 m."""
+    entries, spans = list[int](), list[float]()
+    for slot in chart.slots:
+        if slot.kind.family in ("revolute", "prismatic", "translation"):
+            entries += range(slot.x.start, slot.x.stop)
+            spans += [np.pi if slot.kind.family == "revolute" else 1.0] * (slot.x.stop - slot.x.start)
+        elif slot.kind.family in ("continuous", "planar"):
+            entries.append(slot.x.stop - 1)
+            spans.append(np.pi)
+    low, high, span = problem.lower[entries], problem.upper[entries], np.array(spans)
+    high = np.where(np.isfinite(high), high, span)
+    return DrawRanges(np.array(entries, dtype=int), np.minimum(np.where(np.isfinite(low), low, -span), high), high)
+
+
+def near_steps(rng: np.random.Generator, shape: tuple[int, ...], base: int) -> Array:
+    """Draw tangent vectors to postures that are near, shape (..., nv); the first ``base`` entries are smaller."""
+    step = rng.normal(size=shape) * rng.uniform(0.1, 0.8, (*shape[:-1], 1))
+    step[..., :base] *= 0.2
+    return np.asarray(step)

@@ -15,7 +15,6 @@ import numpy as np
 
 from impact_posture.errors import InputError
 from impact_posture.posture.manifold.constraint_manifold import ConstraintManifold
-from impact_posture.posture.manifold.feasible_start import random_posture
 from impact_posture.system.arrays import Array
 
 # Steps along a curve, rad or m: the first step, the longest step, and the step below which the curve is treated as
@@ -119,9 +118,7 @@ def component_through(manifold: ConstraintManifold, x: Array) -> SelfMotion:
 
 def _random(manifold: ConstraintManifold, rng: np.random.Generator) -> Array:
     """Return random postures on the manifold and within the limits; they may violate inequalities."""
-    problem = manifold.problem
-    drawn = [random_posture(problem, manifold.chart, rng, None if k % 4 else problem.given) for k in range(_BATCH)]
-    projected = manifold.project(np.array([manifold.chart.to_x(q) for q in drawn]), within=True)
+    projected = manifold.project(manifold.draw(rng, _BATCH, manifold.problem.given), within=True)
     return projected.x[projected.converged]
 
 

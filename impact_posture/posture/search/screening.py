@@ -1,9 +1,10 @@
-"""Screen many random postures by batch descents, hop from the best, and choose the starts of IPOPT.
+"""Screen many random postures by batch descents, hop from good ends, and choose the starts of IPOPT.
 
 The objective at a posture hardly predicts the optimum below it, so each posture descends first
-(:mod:`impact_posture.posture.manifold.batch_descent`).  A hop gives random values to some joints of one of the best
-ends and descends from there (D. J. Wales and J. P. K. Doye, "Global optimization by basin-hopping", J. Phys. Chem. A
-1997), because many optima differ in a few joints only.  All limits are counts, so a seed determines the result.
+(:mod:`impact_posture.posture.manifold.batch_descent`).  A hop gives other values to some joints of a good end and
+descends from there (D. J. Wales and J. P. K. Doye, "Global optimization by basin-hopping", J. Phys. Chem. A 1997),
+because many optima differ in a few joints only.  Hops from the best end alone seldom leave it.  The hops that reach a
+better optimum often start from worse ends.  All limits are counts, so a seed determines the result.
 """
 
 from __future__ import annotations
@@ -17,28 +18,36 @@ from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.posture.constraints.constraint import ExpressionConstraint
 from impact_posture.posture.manifold.batch_descent import BatchDescent, Ends
 from impact_posture.posture.manifold.constraint_manifold import ConstraintManifold
-from impact_posture.posture.manifold.feasible_start import FEASIBLE, Projector, random_posture
+from impact_posture.posture.manifold.feasible_start import FEASIBLE, Projector
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem
 from impact_posture.posture.search.unseen_optima import SAME_VALUE, hits_by_value
 from impact_posture.system.arrays import Array
 
-# Number of descents under way.  New descents begin when a quarter of them has ended.
-_WIDTH = 256
+# Number of descents under way.  New descents begin when a quarter of them has ended.  When no more may begin, the
+# search does not wait for this share, because a small batch takes nearly as long as a large one.
+_WIDTH, _SLOWEST = 512, 1 / 16
 # The number of descents, times the third power of the degrees of freedom, is limited by the first number, because
 # descents of large robots take longer.  At least the second number is allowed.
 _WORK, _LEAST = 1_300_000, 16
-# Share of the random postures near the initial posture, and of the new descents that are hops.
-_NEAR, _HOPPING = 0.25, 0.5
-# Number of best ends from which hops start, and shares of the joints to which a hop gives random values.
-_ELITE, _REDRAWN = 4, (0.1, 0.25, 0.5)
+# Share of the new descents that are hops.
+_HOPPING = 0.75
+# The chance that a hop starts at an optimum falls with the rank of the optimum to the power of the first number, and,
+# after as many hops as the second number, with the square of its hops.
+_RANKED, _TIRED = 0.7, 8
+# Shares of the joints to which a hop gives other values, rounded up, and the share of hops that take the values from
+# another optimum instead of random ones.
+_REDRAWN, _CROSSED = (0.1, 0.2, 0.3, 0.5), 0.6
 # Distance (rad, m) below which two ends are the same optimum if their merits differ by less than SAME_VALUE.
 _SAME = 0.05
-# The search stops when the best end was hit this often, and no better end was reached in the last share of all
-# descents.
-_HITS, _IDLE = 3, 0.5
-# Number of starts of IPOPT, half of them at the best ends and half at the most different good ends.  The number,
-# times the degrees of freedom, is limited by the second number, because a solution takes longer for large robots.
+# The search stops when random postures and hops from worse ends reached the best merit this often, after at least the
+# second number of ends, and the last share of all ends did not lower it.
+_HITS, _ENDS, _IDLE = 12, 256, 0.5
+# Number of starts of IPOPT, half of them at the best ends and half at the most different good ends.  If descents
+# ignored no constraint, half as many suffice.  The number, times the degrees of freedom, is limited by the second
+# number, because a solution takes longer for large robots.
 _GUESSES, _SOLVED = 12, 200
+# Tag of a descent from a random posture.  The tag of a hop is the end where it started.
+_RANDOM = -1
 
 
 @dataclass(frozen=True)
@@ -74,90 +83,92 @@ def screen(problem: ConstrainedProblem, initial: Array, most: int, seed: int) ->
     while True:
         room = width - search.descent.active
         if room >= width // 4:
-            if search.settled(max(width // 2, 1)):
+            if search.settled(max(min(_ENDS, width // 2), 1)):
                 break
             count = min(room, most - drawn)
             search.begin(count)
             drawn += count
-            if not search.descent.active:
+            if drawn == most and search.descent.active <= _SLOWEST * len(search.ends.x):
                 break
-        search.ends = search.ends.joined(search.descent.step())
+        search.step()
     return search.result()
 
 
 class _Search:
     def __init__(self, problem: ConstrainedProblem, initial: Array, seed: int) -> None:
         self.descent = BatchDescent(ConstraintManifold(problem))
-        self.ends = Ends(np.zeros((0, self.descent.manifold.chart.nx)), np.zeros(0), np.zeros(0, dtype=int))
+        self._manifold = self.descent.manifold
+        self.ends = Ends(np.zeros((0, self._manifold.chart.nx)), np.zeros(0), np.zeros(0, dtype=int))
         self._problem, self._initial, self._rng = problem, initial, np.random.default_rng([seed, 2])
+        # For each optimum: an end, the embedded posture there, the number of random postures that reached it, and the
+        # number of hops from it.
+        self._end, self._hits, self._tries = list[int](), list[int](), list[int]()
+        self._points = np.zeros((0, self._manifold.embed(self.ends.x).shape[1]))
         self._hops = 0
 
     def begin(self, count: int) -> None:
         """Begin random descents and hops."""
         if not count:
             return
+        x, tag = self._manifold.draw(self._rng, count, self._initial), np.full(count, _RANDOM)
         hops = int(_HOPPING * count) if len(self.ends.x) else 0
-        x = self._random(count)
         if hops:
-            x[:hops] = self._hop(x[:hops])
+            x[:hops], tag[:hops] = self._hop(x[:hops])
             self._hops += hops
-        self.descent.add(x, (np.arange(count) < hops).astype(int))
+        self.descent.add(x, tag)
+
+    def step(self) -> None:
+        """Continue all descents, and count the random postures that reached each optimum."""
+        ends = self.descent.step()
+        first, self.ends = len(self.ends.x), self.ends.joined(ends)
+        for k, point in enumerate(self._manifold.embed(ends.x), first):
+            same = np.linalg.norm(self._points - point, axis=1) < _SAME
+            same &= np.abs(self.ends.merit[self._end] - self.ends.merit[k]) < SAME_VALUE
+            if not same.any():
+                self._end, self._hits, self._tries = [*self._end, k], [*self._hits, 0], [*self._tries, 0]
+                self._points = np.concatenate([self._points, point[None]])
+            self._hits[same.argmax() if same.any() else -1] += int(self.ends.tag[k] == _RANDOM)
 
     def settled(self, least: int) -> bool:
-        """Return whether the best end was hit often enough, and reached early enough."""
-        if len(self.ends.x) < least:
+        """Return whether the best merit was reached often enough, and early enough."""
+        merit, tag = self.ends.merit, self.ends.tag
+        if len(merit) < least:
             return False
-        best = np.flatnonzero(self.ends.merit <= self.ends.merit.min() + SAME_VALUE)
-        hits = int((self.ends.tag[best] == 0).sum())
-        return hits >= _HITS and bool(best[0] < (1 - _IDLE) * len(self.ends.x))
+        best = merit <= merit.min() + SAME_VALUE
+        hits = int((best & ((tag == _RANDOM) | ~best[tag])).sum())
+        return hits >= _HITS and bool(best.argmax() < (1 - _IDLE) * len(merit))
 
     def result(self) -> Screening:
         """Return the guesses and the hits of all ends."""
-        manifold = self.descent.manifold
-        leaders, label = self._optima()
-        hits = np.bincount(label[self.ends.tag == 0], minlength=len(leaders))
+        order = np.argsort(self.ends.merit[self._end], kind="stable")
         projector, guesses = Projector(self._problem), dict[int, Array]()
-        count = min(_GUESSES, _SOLVED // self._problem.robot.nv)
-        for k in _best_and_different(manifold.embed(self.ends.x[leaders]), max(count, 2)):
-            projection = projector.project(manifold.to_q(self.ends.x[leaders[k]]))
+        partial = not all(isinstance(c, ExpressionConstraint) for c in self._problem.constraints)
+        count = min(_GUESSES if partial else _GUESSES // 2, _SOLVED // self._problem.robot.nv)
+        for k in order[_best_and_different(self._points[order], max(count, 2))]:
+            projection = projector.project(self._manifold.to_q(self.ends.x[self._end[k]]))
             if projection.violation <= FEASIBLE:
                 guesses[k] = projection.q
-        values = hits_by_value(self.ends.merit, self.ends.tag == 0)
-        partial = not all(isinstance(c, ExpressionConstraint) for c in self._problem.constraints)
-        return Screening(tuple(guesses.values()), tuple(int(hits[k]) for k in guesses), values, partial, self._hops)
+        values = hits_by_value(self.ends.merit, self.ends.tag == _RANDOM)
+        return Screening(tuple(guesses.values()), tuple(self._hits[k] for k in guesses), values, partial, self._hops)
 
-    def _optima(self, most: int | None = None) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
-        """Return the indices of distinct ends, best first, and for each end the position of its optimum in them."""
-        points, merit = self.descent.manifold.embed(self.ends.x), self.ends.merit
-        leaders, label = list[int](), np.full(len(merit), -1)
-        for k in np.argsort(merit, kind="stable"):
-            near = np.linalg.norm(points[leaders] - points[k], axis=1) < _SAME
-            near &= merit[k] - merit[leaders] < SAME_VALUE
-            if near.any():
-                label[k] = int(near.argmax())
-                continue
-            if len(leaders) == most:
-                break
-            label[k] = len(leaders)
-            leaders.append(int(k))
-        return np.array(leaders, dtype=int), label
-
-    def _hop(self, other: Array) -> Array:
-        """Return postures of the best ends with some joints of the postures ``other``, shape (N, nx)."""
-        rng, slots = self._rng, self.descent.manifold.chart.slots
-        leaders, _ = self._optima(_ELITE)
-        x = self.ends.x[leaders[rng.integers(len(leaders), size=len(other))]]
-        share = rng.choice(_REDRAWN, size=len(other))
-        redrawn = np.zeros(x.shape, dtype=bool)
-        for slot in slots:
-            if slot.kind.family != "free-flyer":
-                redrawn[:, slot.x] = (rng.random(len(other)) < share)[:, None]
-        return np.where(redrawn, other, x)
-
-    def _random(self, count: int) -> Array:
-        chart, near = self.descent.manifold.chart, self._rng.random(count) < _NEAR
-        drawn = [random_posture(self._problem, chart, self._rng, self._initial if k else None) for k in near]
-        return np.array([chart.to_x(q) for q in drawn])
+    def _hop(self, other: Array) -> tuple[Array, NDArray[np.int_]]:
+        """Return ends with some joints of other ends or of postures, shape (N, nx), and the index of each end."""
+        rng, count = self._rng, len(other)
+        rank = np.argsort(np.argsort(self.ends.merit[self._end]))
+        weight = (1 + rank) ** -_RANKED / (1 + np.array(self._tries) / _TIRED) ** 2
+        optimum, another = rng.choice(len(weight), size=(2, count), p=weight / weight.sum())
+        for k in optimum:
+            self._tries[k] += 1
+        joints = [slot for slot in self._manifold.chart.slots if slot.kind.family != "free-flyer"]
+        number = np.ceil(rng.choice(_REDRAWN, size=(count, 1)) * len(joints))
+        chosen = rng.random((count, len(joints))).argsort(axis=1).argsort(axis=1) < number
+        redrawn = np.zeros(other.shape, dtype=bool)
+        for slot, rows in zip(joints, chosen.T, strict=True):
+            redrawn[rows, slot.x] = True
+        ends = np.array(self._end)
+        crossed = rng.random((count, 1)) < _CROSSED
+        other = np.where(crossed, self.ends.x[ends[another]], other)
+        return np.where(redrawn, other, self.ends.x[ends[optimum]]), ends[optimum]
 
 
 def _best_and_different(points: Array, count: int) -> list[int]:
