@@ -32,6 +32,8 @@ _POSES = ((7, "full"), (6, "aligned"), (4, "position"), (0, "free"))
 _SPEED = 100.0
 # Smallest distance (m) of the center of mass from the edges of the support polygon for com_over_feet.
 _LEAST_DEPTH = 0.02
+# Feet whose heights differ by less than this (m) are at the same height.
+_UNEVEN = 1e-3
 
 
 def write_draft(robot: str, options: LoadOptions, out: Path | None, *, force: bool = False) -> tuple[Path, Draft]:
@@ -207,21 +209,27 @@ def _supports(draft: Draft, robot: Robot, feet: Sequence[Support]) -> None:
     if robot.floating and not feet:
         text = "No feet were found, so the robot is assumed to float. If it stands, list each foot:"
         draft.note(text, "[[supports]]", 'frame = "FOOT"', 'kind = "point"')
-    placements = guess.upright_frames(robot)
-    for foot in feet:
+    frames = guess.upright_frames(robot).oMf
+    placements = [frames[robot.frame_id(foot.frame)] for foot in feet]
+    heights = [at.act(np.array(foot.offset))[2] for at, foot in zip(placements, feet, strict=True)]
+    uneven = float(max(heights) - min(heights)) if feet else 0.0
+    text = f"; the feet differ by {1e3 * uneven:.2g} mm in height, so compare their shapes"
+    differ = text if uneven > _UNEVEN else ""
+    for at, foot in zip(placements, feet, strict=True):
         draft.lines += ["", "[[supports]]"]
         draft.key("frame", foot.frame, "a foot according to the SRDF, its name or its height", guessed=True)
         reason = "its shapes are flat below" if any(foot.size) else "one of two feet, on a leg of six joints"
         reason = reason if foot.kind == "surface" else "its shapes are not flat below"
         draft.key("kind", foot.kind, reason, guessed=True)
         if any(foot.offset):
-            draft.key("offset", list(foot.offset), "lowest point of its shapes at the default posture")
+            lowest = f"lowest point of its shapes at the default posture{differ}"
+            draft.key("offset", list(foot.offset), lowest, guessed=bool(differ))
         else:
             draft.lines += comment_lines(
-                "offset: it has no shape that can be read, so the frame's origin touches the ground"
+                "offset: the origin of the frame, because the foot ends there or has no shape that can be read"
             )
         if any(foot.size):
-            tilt = np.degrees(np.arccos(min(1.0, placements.oMf[robot.frame_id(foot.frame)].rotation[2, 2])))
+            tilt = np.degrees(np.arccos(min(1.0, at.rotation[2, 2])))
             flat = "" if tilt < 1 else f"; it is tilted by {tilt:.2g} degrees at the default posture"
             draft.key("size", list(foot.size), f"m, half of the sole, from its shapes{flat}", guessed=bool(flat))
 

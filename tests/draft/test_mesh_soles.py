@@ -87,6 +87,17 @@ def test_sensors_below_a_sole_are_not_feet(tmp_path: Path) -> None:
     assert {support.offset for support in spec.supports} == {(0.02, 0.0, -0.01)}
 
 
+def test_feet_with_different_shapes_are_a_guess(tmp_path: Path) -> None:
+    """Published robots may have collision shapes for one foot and only a visual mesh for the other."""
+    write_hull(tmp_path / "foot.stl", SOLE - 1.5 * UP)
+    left, _, right = biped(BOX).rpartition(BOX)
+    for other, words in ((MESH.format(""), "differ by 3 mm in height, so compare their shapes"), (BOX, "")):
+        (tmp_path / "biped.urdf").write_text(left + other + right)
+        draft = write_draft(str(tmp_path / "biped.urdf"), LoadOptions(), None, force=True)[1]
+        offsets = [line for line in draft.guesses if line.startswith("offset")]
+        assert len(offsets) == (2 if words else 0) and all(words in line for line in offsets)
+
+
 def test_a_round_mesh_is_a_point(tmp_path: Path) -> None:
     """Two feet on legs of six joints are surfaces; a ball gives them no size."""
     for support in drafted(tmp_path, MESH.format(""), ball()).supports:
