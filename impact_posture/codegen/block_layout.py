@@ -54,16 +54,14 @@ class Layout:
 
 
 def lay_out(
-    graph: Graph, functions: Sequence[Sequence[str]], block: int = _BLOCK, *, in_order: bool = False
+    graph: Graph, functions: Sequence[Sequence[str]], block: int = _BLOCK, order: Sequence[int] = ()
 ) -> Layout:
     """Divide a graph into blocks of at most ``block`` statements.
 
-    ``functions`` contains the names of the outputs of each exported function.  With ``in_order``, operations keep the
-    order of the graph.
+    ``functions`` contains the names of the outputs of each exported function.  ``order`` contains the nodes that
+    the functions need; by default, the order is depth first.
     """
-    order = depth_first(graph, [k for names in functions for name in names for k in graph.outputs[name]])
-    if in_order:
-        order.sort()
+    order = order or depth_first(graph, [k for names in functions for name in names for k in graph.outputs[name]])
     angles, trig = _trig(graph, order)
     leaves = frozenset(k for k in order if graph.nodes[k].op in ("const", "in", "lane") or k in trig)
     needed = _needed(graph, functions, leaves)

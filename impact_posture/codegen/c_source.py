@@ -37,7 +37,7 @@ _BATCH_BLOCK = 60
 # The compiler stores more values of a longer function in memory than its separate blocks store.
 _INLINED = 6000
 # Largest number of statements in a block that is not inlined.
-_CUDA_BLOCK = 100
+_CUDA_BLOCK = 300
 
 
 @dataclass(frozen=True)
@@ -168,15 +168,13 @@ def _cuda(
     prefix: str,
     real: Real,
 ) -> CudaSource:
-    graph = reorder_sums(scalars)
-    whole = [lay_out(graph, [function.outputs], len(graph.nodes)) for function in library.functions]
-    inlined = max(len(layout.inlined) + len(layout.blocks[0].nodes) for layout in whole if layout.blocks) <= _INLINED
+    orders = [order_by_limb(scalars, function.outputs, limb_of) for function in library.functions]
+    longest = max(map(len, orders))
+    block = longest if (inlined := longest <= _INLINED) else _CUDA_BLOCK
     constants = Constants(prefix, real, "static __constant__ const")
     functions = []
-    for function, layout in zip(library.functions, whole, strict=True):
-        if not inlined:
-            ordered = order_by_limb(scalars, function.outputs, limb_of)
-            layout = lay_out(ordered, [function.outputs], _CUDA_BLOCK, in_order=True)
+    for function, order in zip(library.functions, orders, strict=True):
+        layout = lay_out(scalars, [function.outputs], block, order)
         emitter = Emitter(layout, f"{function.stem}_{function.name}", real, {1: real.name}, constants)
         own = {"blocks": emitter.blocks, "angles": _angles(layout), "work": layout.sizes.get(1, 0)}
         functions.append(_variables(function, emitter, [b.call for b in emitter.blocks], normals) | own)

@@ -1,8 +1,7 @@
-"""Order operations limb by limb, and compute values again instead of keeping them, for processors with few registers.
+"""Order operations limb by limb, for processors with few registers.
 
-A sweep over the kinematic tree visits each limb once, and a gradient needs several sweeps.  A limb has few values,
-and the body passes few values between limbs.  So a visit computes the values of earlier visits to the same limb
-again, and only values of the body are kept.  For a humanoid, this doubles the operations and halves the memory.
+A sweep over the kinematic tree visits each limb once.  A limb has few values, and the body passes few values between
+limbs.  So few values must be kept at a time if each visit of a limb is computed in one piece.
 """
 
 from __future__ import annotations
@@ -14,9 +13,6 @@ import pinocchio as pin
 
 from impact_posture.codegen.block_layout import depth_first
 from impact_posture.codegen.expression_graph import COSINE, SINE, Graph
-
-# A visit of fewer operations uses kept values, because computing them again would take longer than the visit.
-_SHORT = 100
 
 
 def limb_of_coordinates(model: pin.Model) -> dict[int, int]:
@@ -36,8 +32,8 @@ def limb_of_coordinates(model: pin.Model) -> dict[int, int]:
     }
 
 
-def order_by_limb(graph: Graph, outputs: Sequence[str], limb_of: Mapping[int, int]) -> Graph:
-    """Return a graph with the same outputs, whose nodes are in the order in which they should be computed.
+def order_by_limb(graph: Graph, outputs: Sequence[str], limb_of: Mapping[int, int]) -> list[int]:
+    """Return the nodes that the outputs need, in the order in which they should be computed.
 
     ``limb_of`` is the result of :func:`limb_of_coordinates`.
     """
@@ -50,38 +46,7 @@ def order_by_limb(graph: Graph, outputs: Sequence[str], limb_of: Mapping[int, in
     for k in order:
         if k not in leaves:
             visit[k] = max((visit[a] + (limb[a] != limb[k]) for a in nodes[k].operands if a not in leaves), default=0)
-    computed = sorted((k for k in order if k not in leaves), key=lambda k: (visit[k], limb[k]))
-    rank = {k: i for i, k in enumerate(computed)}
-    sizes = Counter((visit[k], limb[k]) for k in computed)
-    ordered = Graph(graph.inputs)
-    new: dict[int, int] = {}
-    fresh: set[int] = set()
-
-    def copy(k: int) -> None:
-        args = nodes[k].args if nodes[k].op in ("const", "in") else tuple(new[a] for a in nodes[k].args)
-        ordered.nodes.append(nodes[k]._replace(args=args))
-        new[k] = len(ordered.nodes) - 1
-
-    for k in order:
-        if k in leaves:
-            copy(k)
-    place = (0, 0)
-    for k in computed:
-        if (visit[k], limb[k]) != place:
-            place = visit[k], limb[k]
-            fresh.clear()
-        again = {k}
-        waiting = [k] if limb[k] and sizes[place] >= _SHORT else []
-        while waiting:
-            missing = set(nodes[waiting.pop()].operands) - leaves - fresh - again
-            missing = {a for a in missing if limb[a] == limb[k]}
-            again |= missing
-            waiting += missing
-        for a in sorted(again - fresh, key=rank.__getitem__):
-            copy(a)
-        fresh |= again
-    ordered.outputs = {name: [new[k] for k in graph.outputs[name]] for name in outputs}
-    return ordered
+    return sorted(order, key=lambda k: (k not in leaves, visit[k], limb[k]))
 
 
 def _limbs(graph: Graph, order: Sequence[int], leaves: set[int], limb_of: Mapping[int, int]) -> dict[int, int]:
