@@ -299,7 +299,8 @@ def test_a_tight_limit_is_kept_and_has_a_multiplier() -> None:
     limits = torque_limits(posed.robot.model)
     limits[tight] = np.abs([torque[tight] for torque in torques]).mean()
     nothing = np.zeros((0, 6))
-    rest = Equilibrium(posed.robot.model, [], 1.0, limits, nothing, Thrusts(), posed.robot.tangent_names)
+    model, coupling, names = posed.robot.model, posed.robot.coupling_matrix, posed.robot.tangent_names
+    rest = Equilibrium(model, [], 1.0, limits, coupling, nothing, Thrusts(), names)
     tighter = Holdable("at rest", rest, "")
     solution = solve(replace(posed, constraints=(*posed.constraints[:-1], tighter)), starts=1, jobs=1)
     assert rest.distribute(solution.q).largest == pytest.approx(1, abs=1e-6)
