@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
@@ -26,6 +27,7 @@ from impact_posture.posture.program.constrained_problem import (
 from impact_posture.posture.search.multistart import Optimum, distinct, hits_of_best, solve
 from impact_posture.system.arrays import nonnegative_least_squares, null_space
 from tests.output.views import PENDULUM
+from tests.support.biped import biped
 from tests.support.helpers import central_gradient
 from tests.support.settings import make_settings
 
@@ -314,6 +316,28 @@ def test_singular_start_drops_no_equation(more: dict) -> None:
     assert all(len(problem.carried(i)) == len(c.lifted_bounds[0]) for i, c in enumerate(problem.constraints))
     solution = solve(problem, starts=6, jobs=1)
     assert solution.certified_starts >= 4
+
+
+def test_legs_without_ankle_roll_get_regular_equalities(tmp_path: Path) -> None:
+    """Such legs allow a sway to first order, as on H1, so one of twelve equations is redundant in every posture."""
+    sole = '<collision><origin xyz="0.02 0 -0.045"/><geometry><box size="0.2 0.08 0.03"/></geometry></collision>'
+    (tmp_path / "biped.urdf").write_text(biped(sole, ankle_roll=False))
+    supports = "".join(
+        f'[[supports]]\nframe = "{side}_foot"\nkind = "surface"\noffset = [0.02, 0.0, -0.06]\n'
+        for side in ("left", "right")
+    )
+    (tmp_path / "robot.toml").write_text(f'[model]\nroot = "free-flyer"\n{supports}')
+    values = {"robot": str(tmp_path / "biped.urdf"), "frame": "hips", "contact_pose": "free", "normal": [-1, 0, 0]}
+    problem = prepare(make_settings({**values, "com": True})).problem
+    q = feasible_start(problem, 1, seed=0)
+    assert q is not None
+    carried = [
+        c.evaluate(Numeric(problem.robot.model).at(q))[1][list(problem.carried(k))]
+        for k, c in enumerate(problem.constraints)
+        if c.equality
+    ]
+    assert np.linalg.svd(np.vstack(carried))[1].min() > 1e-3
+    assert solve(problem, starts=4, jobs=1).certified_starts >= 2
 
 
 def test_turns_that_change_nothing_are_fixed() -> None:

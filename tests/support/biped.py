@@ -19,16 +19,18 @@ def write_hull(path: Path, points: Array) -> None:
     path.write_bytes(b"\0" * 80 + struct.pack("<I", len(triangles)) + records.tobytes())
 
 
-def biped(foot: str) -> str:
+def biped(foot: str, ankle_roll: bool = True) -> str:
     """Return the URDF of a biped; ``foot`` are the shapes of its links ``left_foot`` and ``right_foot``.
 
-    The ankles are 0.66 m below the hips.
+    The ankles are 0.66 m below the hips.  Without ``ankle_roll``, the legs have five joints.
     """
     hips = _link("hips", 8.0, _box("0.16 0.2 0.12", 0.1))
-    return f'<robot name="biped">{hips}{_leg("left", 1, foot)}{_leg("right", -1, foot)}</robot>'
+    return (
+        f'<robot name="biped">{hips}{_leg("left", 1, foot, ankle_roll)}{_leg("right", -1, foot, ankle_roll)}</robot>'
+    )
 
 
-def _leg(side: str, sign: int, foot: str) -> str:
+def _leg(side: str, sign: int, foot: str, ankle_roll: bool) -> str:
     links = [
         ("hip1", "0 {y} 0", "0 0 1", (-1.0, 1.0), 0.5, ""),
         ("hip2", "0 0 -0.03", "1 0 0", (-0.6, 0.6), 0.5, ""),
@@ -37,6 +39,8 @@ def _leg(side: str, sign: int, foot: str) -> str:
         ("fork", "0 0 -0.3", "0 1 0", (-1.0, 1.0), 0.3, ""),
         ("foot", "0 0 0", "1 0 0", (-0.4, 0.4), 0.6, foot),
     ]
+    if not ankle_roll:
+        links[-2:] = [("foot", "0 0 -0.3", "0 1 0", (-1.0, 1.0), 0.9, foot)]
     parent, text = "hips", ""
     for name, xyz, axis, (low, high), mass, shapes in links:
         child = f"{side}_{name}"

@@ -29,6 +29,9 @@ from impact_posture.system.arrays import Array, independent_rows, null_space
 _TRIAL, _SURVIVES = 0.05, 0.1
 # Number of random feasible postures at which ranks are compared.
 _SAMPLES = 4
+# Singular values up to this value are zero at a projected posture.  A violation of 1e-9 leaves its root, 3e-5, along
+# motions that the constraints block only to second order, for example a sway on legs without ankle roll.
+_BLURRED = 5e-5
 
 
 def fix_undetermined_motions(
@@ -107,9 +110,9 @@ def make_well_posed(problem: ConstrainedProblem) -> ConstrainedProblem:
                 notes.append(f"{turn.name} held: the feet block it, although their linearization allows it")
     problem = replace(problem, constraints=(*problem.constraints, *added), notes=(*problem.notes, *notes))
     # A posture may happen to be singular, for example with a straight arm, so use the posture with the highest rank.
-    generic = max(postures, key=lambda q: rank(equality_jacobian(problem, numeric.at(q))))
+    generic = max(postures, key=lambda q: rank(equality_jacobian(problem, numeric.at(q)), _BLURRED))
     jacobian = equality_jacobian(problem, numeric.at(generic))
-    if rank(jacobian) == len(jacobian):
+    if rank(jacobian, _BLURRED) == len(jacobian):
         return problem
     return replace(problem, rows=_independent_rows(problem, numeric.at(generic)))
 
@@ -146,7 +149,7 @@ def _independent_rows(problem: ConstrainedProblem, numeric: Numeric) -> tuple[tu
     # The rows are multiplied by ``Constraint.price``, so that redundant rows with a low price are omitted first.
     stacked = np.vstack([c.price * c.evaluate(numeric)[1] for _, c in equalities])
     stacked[:, held] = 0.0
-    chosen = {labels[k] for k in independent_rows(stacked, RANK_TOLERANCE)}
+    chosen = {labels[k] for k in independent_rows(stacked, _BLURRED)}
     return tuple(
         tuple(row for row in range(len(c.lifted_bounds[0])) if not c.equality or (index, row) in chosen)
         for index, c in enumerate(problem.constraints)

@@ -125,9 +125,9 @@ class ConstrainedProblem:
         return lines
 
 
-def rank(jacobian: Array) -> int:
-    """Return the rank of a constraint Jacobian, with :data:`RANK_TOLERANCE`."""
-    return int(np.linalg.matrix_rank(jacobian, tol=RANK_TOLERANCE)) if jacobian.size else 0
+def rank(jacobian: Array, tolerance: float = RANK_TOLERANCE) -> int:
+    """Return the rank of a constraint Jacobian; singular values up to ``tolerance`` count as zero."""
+    return int(np.linalg.matrix_rank(jacobian, tol=tolerance)) if jacobian.size else 0
 
 
 def equality_jacobian(problem: ConstrainedProblem, numeric: Numeric) -> Array:
