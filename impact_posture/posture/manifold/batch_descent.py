@@ -19,11 +19,10 @@ from numpy.typing import NDArray
 from impact_posture.posture.manifold.constraint_manifold import ConstraintManifold, right_inverse, times
 from impact_posture.system.arrays import Array
 
-# Residual (m, rad) below which a posture satisfies the equalities, the residual of a descent that may end, and the
-# largest residual of an accepted step.
-_SATISFIED, _NEAR, _DRIFT = 1e-6, 1e-3, 0.1
-# Number of Gauss–Newton steps from a drawn posture, and from the last posture of a descent.
-_PROJECTING, _RETURNING = 15, 2
+# Residual (m, rad) with which a descent may begin and end, and the largest residual of an accepted step.
+_NEAR, _DRIFT = 1e-4, 0.1
+# Number of Gauss–Newton steps from a drawn posture.
+_PROJECTING = 10
 # First and largest trust radius (rad, m), and the radius below which a descent gives up.
 _FIRST, _LONGEST, _SHORTEST = 0.3, 0.6, 1e-6
 # Share of the predicted decrease that a step must reach, and the factor that shortens a rejected step.
@@ -102,10 +101,14 @@ class _State(_Points):
 
 
 class BatchDescent:
-    """Descents on a manifold.  :meth:`add` begins descents, :meth:`step` continues all."""
+    """Descents on a manifold.  :meth:`add` begins descents, :meth:`step` continues all.
+
+    Attributes:
+        stuck: Tags of the descents that ended off the equalities, shape (K,).
+    """
 
     def __init__(self, manifold: ConstraintManifold) -> None:
-        self.manifold = manifold
+        self.manifold, self.stuck = manifold, np.zeros(0, dtype=int)
         self._state = self._begin(np.zeros((0, manifold.chart.nx)), np.zeros(0, dtype=int))
 
     @property
@@ -118,9 +121,8 @@ class BatchDescent:
 
         Return the number of descents that began.
         """
-        projected = self.manifold.project(x, _PROJECTING, within=True, tolerance=_SATISFIED)
-        on = projected.residual <= _NEAR
-        begun = self._begin(projected.x[on], tag[on])
+        projected = self.manifold.project(x, _PROJECTING, within=True, tolerance=_NEAR)
+        begun = self._begin(projected.x[projected.converged], tag[projected.converged])
         begun = begun.taken(np.isfinite(begun.merit))
         self._state = self._state.joined(begun)
         return len(begun.x)
@@ -148,8 +150,9 @@ class BatchDescent:
         decrease = -(s.direction * s.gradient).sum(axis=1)
         ended = ((decrease < _CONVERGED) & (s.residual <= _NEAR)) | (s.radius < _SHORTEST) | (s.age >= _STEPS)
         self._state, ends = s.taken(~ended), s.taken(ended)
-        at = manifold.project(ends.x, _RETURNING, within=True, tolerance=_SATISFIED)
-        return Ends(at.x, ends.merit, ends.tag).taken((ends.residual <= _NEAR) & at.converged)
+        on = ends.residual <= _NEAR
+        self.stuck = np.append(self.stuck, ends.tag[~on])
+        return Ends(ends.x, ends.merit, ends.tag).taken(on)
 
     def _begin(self, x: Array, tag: NDArray[np.int_]) -> _State:
         point, count, nv = self._points(x), len(x), self.manifold.chart.nv

@@ -43,7 +43,7 @@ _SAME = 0.05
 # second number of ends, and the last share of all ends did not lower it.
 _HITS, _ENDS, _IDLE = 12, 256, 0.5
 # Number of starts of IPOPT, half of them at the best ends and half at the most different good ends.  If descents
-# ignored no constraint, half as many suffice.  The number, times the degrees of freedom, is limited by the second
+# ignored no constraint, a third suffices.  The number, times the degrees of freedom, is limited by the second
 # number, because a solution takes longer for large robots.
 _GUESSES, _SOLVED = 12, 200
 # Tag of a descent from a random posture.  The tag of a hop is the end where it started.
@@ -58,7 +58,7 @@ class Screening:
         guesses: Postures from which IPOPT starts, shape (nq,) each.
         hits: Number of random postures that descended to each guess.
         values: For each distinct objective where descents ended, best first: the number of random postures that
-            descended to it.
+            descended to it.  The last values are ones, each for a random posture whose descent got stuck.
         partial: Whether the problem has constraints that descents ignore, such as clearances.
         hops: Number of hops.
     """
@@ -100,10 +100,11 @@ class _Search:
         self._manifold = self.descent.manifold
         self.ends = Ends(np.zeros((0, self._manifold.chart.nx)), np.zeros(0), np.zeros(0, dtype=int))
         self._problem, self._initial, self._rng = problem, initial, np.random.default_rng([seed, 2])
-        # For each optimum: an end, the embedded posture there, the number of random postures that reached it, and the
-        # number of hops from it.
-        self._end, self._hits, self._tries = list[int](), list[int](), list[int]()
+        # For each optimum: an end, the merit and the embedded posture there, the number of random postures that
+        # reached it, and the number of hops from it.
+        self._end, self._merit = np.zeros(0, dtype=int), np.zeros(0)
         self._points = np.zeros((0, self._manifold.embed(self.ends.x).shape[1]))
+        self._hits, self._tries = np.zeros(0, dtype=int), np.zeros(0, dtype=int)
         self._hops = 0
 
     def begin(self, count: int) -> None:
@@ -121,13 +122,15 @@ class _Search:
         """Continue all descents, and count the random postures that reached each optimum."""
         ends = self.descent.step()
         first, self.ends = len(self.ends.x), self.ends.joined(ends)
-        for k, point in enumerate(self._manifold.embed(ends.x), first):
-            same = np.linalg.norm(self._points - point, axis=1) < _SAME
-            same &= np.abs(self.ends.merit[self._end] - self.ends.merit[k]) < SAME_VALUE
-            if not same.any():
-                self._end, self._hits, self._tries = [*self._end, k], [*self._hits, 0], [*self._tries, 0]
+        for k, point in enumerate(self._manifold.embed(ends.x)):
+            same = np.flatnonzero(np.abs(self._merit - ends.merit[k]) < SAME_VALUE)
+            same = same[np.linalg.norm(self._points[same] - point, axis=1) < _SAME]
+            if not same.size:
+                same = np.array([len(self._end)])
+                self._end, self._merit = np.append(self._end, first + k), np.append(self._merit, ends.merit[k])
                 self._points = np.concatenate([self._points, point[None]])
-            self._hits[same.argmax() if same.any() else -1] += int(self.ends.tag[k] == _RANDOM)
+                self._hits, self._tries = np.append(self._hits, 0), np.append(self._tries, 0)
+            self._hits[same[0]] += ends.tag[k] == _RANDOM
 
     def settled(self, least: int) -> bool:
         """Return whether the best merit was reached often enough, and early enough."""
@@ -140,35 +143,37 @@ class _Search:
 
     def result(self) -> Screening:
         """Return the guesses and the hits of all ends."""
-        order = np.argsort(self.ends.merit[self._end], kind="stable")
+        order = np.argsort(self._merit, kind="stable")
         projector, guesses = Projector(self._problem), dict[int, Array]()
         partial = not all(isinstance(c, ExpressionConstraint) for c in self._problem.constraints)
-        count = min(_GUESSES if partial else _GUESSES // 2, _SOLVED // self._problem.robot.nv)
+        count = min(_GUESSES if partial else _GUESSES // 3, _SOLVED // self._problem.robot.nv)
         for k in order[_best_and_different(self._points[order], max(count, 2))]:
             projection = projector.project(self._manifold.to_q(self.ends.x[self._end[k]]))
             if projection.violation <= FEASIBLE:
                 guesses[k] = projection.q
-        values = hits_by_value(self.ends.merit, self.ends.tag == _RANDOM)
-        return Screening(tuple(guesses.values()), tuple(self._hits[k] for k in guesses), values, partial, self._hops)
+        # Where stuck descents would have led is unknown.
+        stuck = (1,) * int((self.descent.stuck == _RANDOM).sum())
+        values = hits_by_value(self.ends.merit, self.ends.tag == _RANDOM) + stuck
+        return Screening(
+            tuple(guesses.values()), tuple(int(self._hits[k]) for k in guesses), values, partial, self._hops
+        )
 
     def _hop(self, other: Array) -> tuple[Array, NDArray[np.int_]]:
         """Return ends with some joints of other ends or of postures, shape (N, nx), and the index of each end."""
         rng, count = self._rng, len(other)
-        rank = np.argsort(np.argsort(self.ends.merit[self._end]))
-        weight = (1 + rank) ** -_RANKED / (1 + np.array(self._tries) / _TIRED) ** 2
+        rank = np.argsort(np.argsort(self._merit))
+        weight = (1 + rank) ** -_RANKED / (1 + self._tries / _TIRED) ** 2
         optimum, another = rng.choice(len(weight), size=(2, count), p=weight / weight.sum())
-        for k in optimum:
-            self._tries[k] += 1
+        self._tries += np.bincount(optimum, minlength=len(weight))
         joints = [slot for slot in self._manifold.chart.slots if slot.kind.family != "free-flyer"]
         number = np.ceil(rng.choice(_REDRAWN, size=(count, 1)) * len(joints))
         chosen = rng.random((count, len(joints))).argsort(axis=1).argsort(axis=1) < number
         redrawn = np.zeros(other.shape, dtype=bool)
         for slot, rows in zip(joints, chosen.T, strict=True):
             redrawn[rows, slot.x] = True
-        ends = np.array(self._end)
         crossed = rng.random((count, 1)) < _CROSSED
-        other = np.where(crossed, self.ends.x[ends[another]], other)
-        return np.where(redrawn, other, self.ends.x[ends[optimum]]), ends[optimum]
+        other = np.where(crossed, self.ends.x[self._end[another]], other)
+        return np.where(redrawn, other, self.ends.x[self._end[optimum]]), self._end[optimum]
 
 
 def _best_and_different(points: Array, count: int) -> list[int]:
