@@ -94,14 +94,14 @@ def build_model(
         UrdfError: The file is missing or is not a URDF, Pinocchio rejects it, or it has too many joints.
         InertiaError: A link has an impossible mass or inertia.
     """
-    root = parse_urdf(path)
+    text, root = _read(path)
     _check_depth(root, path)
     below_zero = clear_negative_limits(root)
     couplings, lost = urdf_couplings(root, str(path))
     try:
         with quiet_stderr() as errors:
             # The decoded text instead of the file, because urdfdom reads each file as UTF-8.
-            text = ET.tostring(root, encoding="unicode") if below_zero or couplings else _xml_text(path)
+            text = ET.tostring(root, encoding="unicode") if below_zero or couplings else text
             model = pin.buildModelFromXML(text, *([pin.JointModelFreeFlyer()] if free_flyer else []))
     except Exception as error:  # The type of exception differs between versions of Pinocchio.
         fault = f"makes no robot ({errors[0] or error})"
@@ -129,6 +129,8 @@ def _check_depth(root: ET.Element, path: Path) -> None:
         children.setdefault(parent, []).append(child)
     level, below = [link for link in children if link not in parents], set(parents)
     for _ in range(_DEEPEST):
+        if not level:
+            break
         level = [child for link in level for child in children.get(link, ())]
         below.difference_update(level)
     if any(link in children for link in level):
@@ -140,7 +142,14 @@ def _check_depth(root: ET.Element, path: Path) -> None:
 
 
 def parse_urdf(path: Path) -> ET.Element:
-    """Return the root element of a URDF; accept all that urdfdom accepts (names with ``:``, any encoding, ``--``).
+    """Return the root element of a URDF; see :func:`_read` for errors."""
+    return _read(path)[1]
+
+
+def _read(path: Path) -> tuple[str, ET.Element]:
+    """Return the text of a URDF without comments, and its root element.
+
+    All that urdfdom accepts is accepted: names with ``:``, any encoding, ``--`` in comments.
 
     Raises:
         UrdfError: The file is missing, is not a URDF, or contains expressions or elements of xacro.
@@ -163,14 +172,13 @@ def parse_urdf(path: Path) -> ET.Element:
     if ("$" in text or "<xacro:" in text) and (leftover := _xacro_leftover(root)):
         fault = f"contains {leftover}, which only xacro can evaluate"
         raise UrdfError(fault, where=str(path), hint="name the file .xacro")
-    return root
+    return text, root
 
 
 def _parse_xml(text: str) -> ET.Element:
-    """Parse XML without namespaces, which have no meaning in a URDF."""
+    """Parse XML without namespaces and without the text between tags, which have no meaning in a URDF."""
     builder, parser = ET.TreeBuilder(), expat.ParserCreate()
     parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end
-    parser.CharacterDataHandler = builder.data
     parser.Parse(text, True)
     return builder.close()
 
