@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 JOBS ?= 2
 
-.PHONY: help demo test coverage wheel test-wheel lowest lint types docs bench bench-gpu study-impacts study-elastic study-global study-feasible study-flow study-robustness study-real-impacts study-verdict study-scan study-controller study-sweep reproduction calibration regression
+.PHONY: help demo test coverage wheel test-wheel lowest lint types docs bench bench-gpu study-impacts study-elastic study-global study-feasible study-flow study-robustness study-real-impacts study-verdict study-robots study-scan study-controller study-sweep reproduction calibration regression
 .PHONY: pictures viewer clean
 
 help:
@@ -27,6 +27,7 @@ help:
 	@echo "make study-real-impacts  compare the rigid model with MuJoCo for throws, strikes and taps (some minutes)"
 	@echo "make study-verdict  simulate the impacts of verdicts, and compare each number (some minutes)"
 	@echo "make study-robustness  measure where each controller helps and which targets it meets (ten minutes; can continue after an interruption)"
+	@echo "make study-robots   inspect, draft and optimize every robot model at hand (some minutes)"
 	@echo "make study-scan     scan postures of an arm and of a humanoid, and draw the results"
 	@echo "make study-controller  compare the controllers in C and Python: equal answers, growth of memory, times (an hour; PART=equality, growth or times runs one part; times needs 4 minutes on a quiet machine)"
 	@echo "make study-sweep    measure the robustness (killed workers and parents, MPI, Slurm jobs) and the speed of sweeps"
@@ -132,6 +133,9 @@ study-robustness: $(VENV)/.installed-test
 	$(BIN)/python -m docs.studies points --jobs $(JOBS)
 	$(BIN)/python -m docs.studies robustness --write
 	$(BIN)/python -m docs.studies envelope --write
+
+study-robots: $(VENV)/.installed-test
+	$(BIN)/python -m docs.studies robots --jobs $(JOBS) --write
 
 study-scan: $(VENV)/.installed-test
 	$(BIN)/python -m docs.studies scan --write

@@ -95,6 +95,7 @@ STUDIES = {
             target="study-verdict",
         ),
         Study("scan", "scan", "a scan along the redundancy; postures of each robot", 11, target="study-scan"),
+        Study("robots", "robots", "all models at hand, from file to posture; starts", 4, target="study-robots"),
         Study("reproduction", "reproduction", "the experiments of the paper; seeds", 10, target="reproduction"),
     )
 }

@@ -23,7 +23,7 @@ _WHEEL = re.compile(r"wheel|caster|track", re.I)
 _ROTOR = re.compile(r"rotor|propeller|motor", re.I)
 _PROPELLER = re.compile(r"rotor|propeller|(?:^|_)props?(?:_|\d|$)", re.I)
 _FINGER = re.compile(r"finger|thumb|gripper|jaw|knuckle|pinky|(?:^|_)(?:index|middle|ring|little|mrl)(?:_|$)", re.I)
-_TOOL = re.compile(r"tcp|tool|(?:^|_)ee(?:f|$|_)|end_?effector|grasp|tip$", re.I)
+_TOOL = re.compile(r"tcp|tool|(?:^|_)ee(?:f|$|_(?![xyz]$))|end_?effector|grasp|tip$", re.I)
 _HAND = re.compile(r"gripper|hand|palm|flange", re.I)
 _SENSOR = re.compile(
     r"imu|camera|optical|laser|lidar|radar|sensor|sonar|range|accelero|gyro|fsr|touch|_itb|_led|dh_frame|skin|visual",

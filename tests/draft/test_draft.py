@@ -29,6 +29,7 @@ from impact_posture.robot.robot_spec import RobotSpec, read_spec
 from impact_posture.robot.urdf import EXAMPLE_PREFIX, example_robot_data, robots_data
 from tests.support.helpers import NAMES
 from tests.support.settings import make_settings
+from tests.support.urdfs import joint, link, load
 
 B1_Z1 = "example-robot-data:b1_description/urdf/b1-z1.urdf"
 FOUR = ("FL_foot", "FR_foot", "RL_foot", "RR_foot")
@@ -219,6 +220,21 @@ def test_a_multirotor_without_joints_is_drafted(tmp_path: Path) -> None:
     assert [rotor.spin for rotor in loaded.spec.propulsion.rotors] == [1, 1, -1, -1]
     with pytest.raises(UrdfError, match="has no movable joint"):
         write_draft(source, LoadOptions(root="fixed"), tmp_path / "fixed.toml")
+
+
+def test_axes_of_an_end_effector_are_no_tool(tmp_path: Path) -> None:
+    """Some MJCFs mark the axes of the hand by sites ``ee_x``, ``ee_y`` and ``ee_z``."""
+    mounts = [
+        joint(f"{name}_mount", f"hand {name}", None, kind="fixed", more="") for name in ("ee_x", "ee_y", "grip")
+    ]
+    tree = [
+        link("base", 1),
+        link("hand", 1),
+        joint("turn", "base hand"),
+        *map(link, ("ee_x", "ee_y", "grip")),
+        *mounts,
+    ]
+    assert tips(load(tmp_path, *tree))[0] == "hand"
 
 
 def test_rotors_of_motors_are_no_propellers(tmp_path: Path) -> None:
