@@ -89,8 +89,10 @@ def table(head: str, rows: Iterator[list[str]]) -> None:
 
 def cores(cases: list[Case]) -> Iterator[list[str]]:
     """Yield the evaluations per second of the C export on all cores of this machine."""
-    for case in cases:
-        got = json.loads(build_cores(case) or run([f"./cores-{case['name']}", case["samples"]]))
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        errors = [*pool.map(build_cores, cases)]
+    for case, error in zip(cases, errors, strict=True):
+        got = json.loads(error or run([f"./cores-{case['name']}", case["samples"]]))
         yield [
             case["name"],
             *(
