@@ -7,6 +7,7 @@ this module.  Geoms that collide with nothing are only visual, and only pictures
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
@@ -48,10 +49,9 @@ def mjcf_shapes(model: Any, first: str = "collision") -> UrdfShapes:
 
     The world of a fixed robot has the shapes of its base.  The surroundings of a floating robot are not its shapes.
     """
-    read, pairs = UrdfShapes([], [], []), {*map(int, model.pair_geom1), *map(int, model.pair_geom2)}
-    for b in range(int(is_floating(model)), model.nbody):
+    read = UrdfShapes([], [], [])
+    for b, solid in solid_geoms(model):
         geoms = range(model.body_geomadr[b], model.body_geomadr[b] + model.body_geomnum[b])
-        solid = [g for g in geoms if model.geom_contype[g] or model.geom_conaffinity[g] or g in pairs]
         visual = [g for g in geoms if g not in solid] if first == "visual" else []
         chosen, body = visual or solid, object_name(model, "body", b)
         if chosen:
@@ -63,6 +63,14 @@ def mjcf_shapes(model: Any, first: str = "collision") -> UrdfShapes:
             except UnusableShape as fault:
                 read.warnings.append(left_out(name, fault))
     return read
+
+
+def solid_geoms(model: Any) -> Iterator[tuple[int, list[int]]]:
+    """Yield each body of the robot with its solid geoms.  Without a free joint, the world is a body of the robot."""
+    pairs = {*map(int, model.pair_geom1), *map(int, model.pair_geom2)}
+    for b in range(int(is_floating(model)), model.nbody):
+        geoms = range(model.body_geomadr[b], model.body_geomadr[b] + model.body_geomnum[b])
+        yield b, [g for g in geoms if model.geom_contype[g] or model.geom_conaffinity[g] or g in pairs]
 
 
 def disabled_bodies(model: Any) -> set[frozenset[str]]:

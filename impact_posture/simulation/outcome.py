@@ -17,12 +17,16 @@ from impact_posture.simulation.run import Run
 from impact_posture.simulation.series import Flags, Series
 from impact_posture.simulation.setup import Setup
 from impact_posture.system.arrays import Array
+from impact_posture.system.escape import xml_name
+from impact_posture.system.optional_package import import_mujoco
 
 # The outcomes are listed from the best to the worst.
 Outcome = Literal["completed", "lost contact", "control lost", "fell"]
 OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)
 # Only every 25th tick is checked for links behind a surface.
 _EVERY = 25
+# Largest number of pairs of touching links that a warning lists.
+_MOST = 4
 # A joint origin that is deeper behind a surface, m, has moved through it.  Compression of a contact is less deep.
 _DEEP = 0.02
 # The prediction fits if the measured jump divided by the predicted jump is in this range.
@@ -87,7 +91,7 @@ def doubts(setup: Setup, runs: Iterable[Run], metrics: Iterable[Metrics], ratio:
             lines.append(f"{what} in {count} ticks of the impact windows")
     if (seconds := sum(m.saturation_inside for m in metrics)) > 0:
         lines.append(f"an actuator was at its limit for {seconds:.2g} s of the impact windows")
-    return (*lines, *_rotors_touch(setup, runs))
+    return (*lines, *_rotors_touch(setup, runs), *_links_touch(setup, runs))
 
 
 def _rotors_touch(setup: Setup, runs: Iterable[Run]) -> Iterator[str]:
@@ -103,6 +107,28 @@ def _rotors_touch(setup: Setup, runs: Iterable[Run]) -> Iterator[str]:
             if t.size:
                 yield f"{propulsion.frame} or a rotor on it touched the surface '{name}' at t = {t[0]:.2f} s"
                 break
+
+
+def _links_touch(setup: Setup, runs: Iterable[Run]) -> Iterator[str]:
+    """Yield a warning with the links of an MJCF that touched each other or a surface, and when they first touched."""
+    built = setup.world.built
+    if not built.link_geoms:
+        return
+    mujoco, model, layout = import_mujoco(), built.mjcf.compile(), built.mjcf.layout
+    data, begins = mujoco.MjData(model), dict[str, float]()
+    labels = {model.geom(name).id: link.body for name, link in built.link_geoms.items()}
+    labels |= {model.geom(xml_name(f"surface {name}")).id: f"the surface '{name}'" for name in built.normals}
+    for t, q in (state for run in runs for state in zip(run.series.t, run.series.q, strict=True)):
+        data.qpos[: layout.nqpos] = layout.qpos(q)
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_collision(model, data)
+        for pair in data.contact.geom[data.contact.dist < 0].tolist() if data.ncon else ():
+            if all(geom in labels for geom in pair):
+                begins.setdefault(" and ".join(sorted(labels[geom] for geom in pair)), float(t))
+    if begins:
+        pairs = [f"{pair} (t = {t:.2f} s)" for pair, t in sorted(begins.items(), key=lambda item: item[1])]
+        more = f" and {len(pairs) - _MOST} more pairs" if len(pairs) > _MOST else ""
+        yield f"these touched: {', '.join(pairs[:_MOST])}{more}"
 
 
 def _below(setup: Setup, q: Array, n: Array, point: Array) -> Flags:

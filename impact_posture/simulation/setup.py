@@ -12,6 +12,7 @@ from impact_posture.robot.posture_files import read_posture, set_joints
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.simulation.scenario_file import Scenario, ScenarioTable
+from impact_posture.simulation.world.mjcf_contacts import contact_warnings
 from impact_posture.simulation.world.world import World, build_world
 from impact_posture.system.arrays import Array
 from impact_posture.system.progress import tell
@@ -44,11 +45,11 @@ class Setup:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Warnings about the scenario that are known before a run."""
-        control = self.scenario.control
+        control, lines = self.scenario.control, tuple(contact_warnings(self.world.built.mjcf, self.robot))
         if not self.robot.floating or control.footing is not None or control.tilt is not None:
-            return ()
+            return lines
         fault = f"no task keeps the base of {self.robot.name} level, so the robot may tilt until it falls"
-        return (f"{fault}: add [control.tilt] to the scenario",)
+        return (*lines, f"{fault}: add [control.tilt] to the scenario")
 
 
 def set_up(scenario: Scenario) -> Setup:

@@ -160,7 +160,8 @@ class ContactLog:
         first, at = np.concatenate([s.rows for s in steps]), np.repeat(np.arange(len(steps)), counts)
         geoms, frames = np.concatenate([s.geoms for s in steps]), np.concatenate([s.frames for s in steps])
         # MuJoCo also lists contacts just outside the surface.  Such contacts do not push and have no address (−1).
-        pushing = first >= 0
+        # Contacts of other geoms have no shape (−1).
+        pushing = (first >= 0) & (self._shape_of[geoms].max(axis=1) >= 0)
         first = (first + np.repeat(starts, counts))[pushing]
         at, geoms, sizes, frames = at[pushing], geoms[pushing], sizes[pushing], frames[pushing].reshape(-1, 3, 3)
         # A contact with friction has three force components, a contact without friction only the normal force.

@@ -133,7 +133,8 @@ class Sensors(StrictTable):
 class Scene(StrictTable):
     """Surroundings of a robot.
 
-    Every shape can touch every surface.  Apart from contacts with a thrown ball, no other contacts are simulated.
+    Every shape can touch every surface.  A thrown ball, the link with the rotors, and the links of an MJCF have
+    further contacts.
     """
 
     surfaces: tuple[Surface, ...] = ()

@@ -14,7 +14,7 @@ from impact_posture.collision.coal_geometry import read_shapes
 from impact_posture.collision.shape_corners import shape_points
 from impact_posture.collision.urdf_shapes import UnusableShape, largest_extent
 from impact_posture.dynamics.chart import Chart
-from impact_posture.dynamics.mjcf import Mjcf, build_mjcf
+from impact_posture.dynamics.mjcf import WORLD, Mjcf, build_mjcf
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import InputError, UnsupportedJoint
 from impact_posture.impact.impact_contact import point_on
@@ -22,6 +22,7 @@ from impact_posture.robot.actuation import actuation_matrix
 from impact_posture.robot.model_joints import joint_range
 from impact_posture.robot.robot import Robot
 from impact_posture.simulation.world.contact_law import ContactLaw
+from impact_posture.simulation.world.mjcf_contacts import LinkGeom, add_link_geoms
 from impact_posture.simulation.world.scene import Physics, Scene, Shape, Surface
 from impact_posture.simulation.world.throw import BALL, Throw, add_ball
 from impact_posture.system.arrays import Array
@@ -47,6 +48,7 @@ class BuiltScene:
         shape_geoms: Name of the geom of each shape, in the order of the shapes in the scene.
         rotor_link: Points whose hull contains the link with the rotors, in the frame of its joint, shape (k, 3), m;
             empty without rotors.
+        link_geoms: Name of each geom from the MJCF of the robot → its link.
         throw: Throw of the ball; ``None`` if the scene has no ball.
     """
 
@@ -56,6 +58,7 @@ class BuiltScene:
     gaps: Mapping[tuple[str, str], float]
     shape_geoms: tuple[str, ...]
     rotor_link: Array
+    link_geoms: Mapping[str, LinkGeom]
     throw: Throw | None = None
 
 
@@ -93,6 +96,11 @@ def build_scene(robot: Robot, scene: Scene, q: Array, throw: Throw | None = None
         for shape, placement in placed
     }
     hulls, rotor_link = _add_rotor_link(mjcf, robot)
+    links = add_link_geoms(mjcf, robot)
+    if robot.floating:
+        # A link with a shape touches surfaces with its shape.  Of a fixed robot, a surface may cut the base.
+        shaped = {WORLD, *(point_on(robot, shape.frame).joint for shape in scene.shapes)}
+        hulls += [geom for geom, link in links.items() if link.joint not in shaped]
     for surface in scene.surfaces:
         name = xml_name(f"surface {surface.name}")
         mjcf.add_plane(name, points[surface.name], normals[surface.name])
@@ -103,7 +111,7 @@ def build_scene(robot: Robot, scene: Scene, q: Array, throw: Throw | None = None
         _add_pair(mjcf, BALL, xml_name(f"shape {throw.frame}"), throw)
     _add_rotors(mjcf, robot)
     _add_motors(mjcf, robot)
-    return BuiltScene(mjcf, normals, points, gaps, tuple(geoms), rotor_link, throw)
+    return BuiltScene(mjcf, normals, points, gaps, tuple(geoms), rotor_link, links, throw)
 
 
 def _add_rotor_link(mjcf: Mjcf, robot: Robot) -> tuple[list[str], Array]:

@@ -1,0 +1,118 @@
+"""Contacts between links as the MJCF of a robot defines them, in the world that MuJoCo simulates."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import combinations
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from impact_posture.collision.mjcf_shapes import solid_geoms
+from impact_posture.dynamics.mjcf import Mjcf, pose
+from impact_posture.robot.mjcf_file import object_name
+from impact_posture.robot.mjcf_model import placement
+from impact_posture.robot.robot import Robot
+from impact_posture.system.arrays import Array
+from impact_posture.system.escape import xml_name
+from impact_posture.system.optional_package import import_mujoco
+
+# Properties of a geom and of a contact pair that determine their contacts.
+_GEOM = ("contype", "conaffinity", "condim", "priority", "friction", "solmix", "solref", "solimp", "margin", "gap")
+_PAIR = ("friction", "solref", "solreffriction", "solimp", "margin", "gap")
+# Options of the MJCF that the scenario replaces.
+_OPTIONS = ("timestep", "integrator", "cone", "impratio", "noslip_iterations")
+
+
+class LinkGeom(NamedTuple):
+    """Solid geom of a robot: its body in the MJCF, and the index of the joint that moves it."""
+
+    body: str
+    joint: int
+
+
+def add_link_geoms(mjcf: Mjcf, robot: Robot) -> dict[str, LinkGeom]:
+    """Add solid geoms, excluded pairs of bodies and contact pairs from the MJCF of a robot; return the geoms by name.
+
+    Each body of the file becomes a body without mass, fixed to the joint that moves it.  Height fields and signed
+    distance fields are left out.  Without an MJCF, nothing is added.
+    """
+    if robot.mjcf is None:
+        return {}
+    mujoco, source = import_mujoco(), robot.mjcf.model
+    names, bodies, added = dict[int, str](), dict[int, str](), dict[str, LinkGeom]()
+    for b, geoms in solid_geoms(source):
+        link = object_name(source, "body", b)
+        frame = robot.model.frames[robot.frame_id(link)] if b else robot.model.frames[0]
+        usable = [g for g in geoms if not _is_field(source, g)]
+        if not usable:
+            continue
+        bodies[b] = xml_name(f"geoms of {link}")
+        body = mjcf.body(frame.parentJoint).add_body(name=bodies[b], **pose(frame.placement))
+        for g in usable:
+            names[g] = xml_name(f"geom {g} of {link}")
+            added[names[g]] = LinkGeom(link, frame.parentJoint)
+            law = {key: getattr(source, f"geom_{key}")[g] for key in _GEOM}
+            at = pose(placement(source.geom_pos[g], source.geom_quat[g]))
+            if source.geom_type[g] == mujoco.mjtGeom.mjGEOM_MESH:
+                convex, points = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX, _hull(source, source.geom_dataid[g])
+                mjcf.spec.add_mesh(name=names[g], uservert=points.ravel(), inertia=convex)
+                law["meshname"] = names[g]
+            body.add_geom(name=names[g], type=source.geom_type[g], size=source.geom_size[g], mass=0.0, **law, **at)
+    # Locked joints merge bodies, so the bodies that are next to each other in the file are excluded one by one.
+    mjcf.spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_FILTERPARENT
+    for first, second in _excluded(source):
+        if first in bodies and second in bodies:
+            mjcf.spec.add_exclude(bodyname1=bodies[first], bodyname2=bodies[second])
+    for p in range(source.npair):
+        one, other = int(source.pair_geom1[p]), int(source.pair_geom2[p])
+        if one in names and other in names:
+            law = {key: getattr(source, f"pair_{key}")[p] for key in _PAIR}
+            mjcf.spec.add_pair(geomname1=names[one], geomname2=names[other], condim=source.pair_dim[p], **law)
+    return added
+
+
+def contact_warnings(mjcf: Mjcf, robot: Robot) -> Iterator[str]:
+    """Yield a line about geoms of the MJCF that are not simulated, and about options that the scenario replaces."""
+    if robot.mjcf is None:
+        return
+    source, usual = robot.mjcf.model, import_mujoco().MjSpec().option
+    if absent := sum(_is_field(source, g) for _, geoms in solid_geoms(source) for g in geoms):
+        yield f"the simulation leaves out height fields and signed distance fields of the MJCF ({absent})"
+    stated = [
+        name
+        for name in _OPTIONS
+        if getattr(source.opt, name) not in (getattr(usual, name), getattr(mjcf.spec.option, name))
+    ]
+    if stated:
+        yield f"the scenario replaces these options of the MJCF: {', '.join(stated)}"
+
+
+def _is_field(model: Any, g: int) -> bool:
+    types = import_mujoco().mjtGeom
+    return bool(model.geom_type[g] == types.mjGEOM_HFIELD or model.geom_type[g] == types.mjGEOM_SDF)
+
+
+def _excluded(model: Any) -> set[tuple[int, int]]:
+    """Return the pairs of bodies that MuJoCo does not let collide, apart from bodies without joints between them."""
+    pairs = {(s >> 16, s & 0xFFFF) for s in map(int, model.exclude_signature)}
+    if model.opt.disableflags & import_mujoco().mjtDisableBit.mjDSBL_FILTERPARENT:
+        return pairs
+    weld = np.asarray(model.body_weldid)
+    parent = weld[np.asarray(model.body_parentid)[weld]]
+    # Bodies that are fixed to the world collide with the bodies next to them.
+    moving = np.flatnonzero(weld)
+    return pairs | {
+        (int(a), int(b)) for a, b in combinations(moving, 2) if parent[a] == weld[b] or parent[b] == weld[a]
+    }
+
+
+def _hull(model: Any, mesh: int) -> Array:
+    """Return the corners of the convex hull with which a mesh collides, m, shape (k, 3)."""
+    corners = np.array(model.mesh_vert[model.mesh_vertadr[mesh] :][: model.mesh_vertnum[mesh]], dtype=float)
+    if model.mesh_graphadr[mesh] < 0:
+        return corners
+    graph = model.mesh_graph[model.mesh_graphadr[mesh] :]
+    # The graph contains the numbers of corners and faces, one address for each corner, and the corners.
+    count = int(graph[0])
+    return np.asarray(corners[graph[2 + count : 2 + 2 * count]])
