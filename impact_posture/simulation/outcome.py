@@ -128,7 +128,7 @@ def _links_touch(setup: Setup, runs: Iterable[Run]) -> Iterator[str]:
     if begins:
         pairs = [f"{pair} (t = {t:.2f} s)" for pair, t in sorted(begins.items(), key=lambda item: item[1])]
         more = f" and {len(pairs) - _MOST} more pairs" if len(pairs) > _MOST else ""
-        yield f"these touched: {', '.join(pairs[:_MOST])}{more}"
+        yield f"links touched: {', '.join(pairs[:_MOST])}{more}"
 
 
 def _below(setup: Setup, q: Array, n: Array, point: Array) -> Flags:

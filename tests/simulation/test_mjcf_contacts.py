@@ -183,12 +183,16 @@ def test_links_without_shapes_touch_surfaces(tmp_path: Path, frame: str) -> None
 
 
 def test_height_fields_and_replaced_options_are_named(tmp_path: Path) -> None:
-    text = ARM.replace("<worldbody>", '<option integrator="RK4" timestep=".001"/><asset><hfield name="h" nrow="2" '
-        'ncol="2" size="1 1 .1 .1"/></asset><worldbody><geom type="hfield" hfield="h" pos="0 0 -1"/>')  # fmt: skip
+    text = ARM.replace(
+        "<worldbody>",
+        '<option integrator="RK4" timestep=".001"><flag contact="disable"/></option>'
+        '<asset><hfield name="h" nrow="2" ncol="2" size="1 1 .1 .1"/></asset>'
+        '<worldbody><geom type="hfield" hfield="h" pos="0 0 -1"/>',
+    )
     for content, lines in (
         (ARM, []),
         (text, ["the simulation leaves out height fields and signed distance fields of the MJCF (1)",
-                "the scenario replaces these options of the MJCF: timestep, integrator"]),
+                "the scenario replaces these options of the MJCF: timestep, integrator, disableflags"]),
     ):  # fmt: skip
         robot = loaded(tmp_path, content)
         mjcf: Mjcf = build_scene(robot, Scene(), robot.posture()).mjcf
@@ -208,4 +212,4 @@ def test_links_that_touch_are_named_after_a_run(tmp_path: Path) -> None:
     moved = replace(run_, series=replace(run_.series, q=folded))
     (line,) = (line for line in doubts(setup, [moved], [], None) if "touched" in line)
     pairs = ("hand and world", "fore and world", "upper and world", "base and upper")
-    assert line == f"these touched: {', '.join(f'{pair} (t = 0.04 s)' for pair in pairs)}"
+    assert line == f"links touched: {', '.join(f'{pair} (t = 0.04 s)' for pair in pairs)}"

@@ -21,7 +21,7 @@ from impact_posture.system.optional_package import import_mujoco
 _GEOM = ("contype", "conaffinity", "condim", "priority", "friction", "solmix", "solref", "solimp", "margin", "gap")
 _PAIR = ("friction", "solref", "solreffriction", "solimp", "margin", "gap")
 # Options of the MJCF that the scenario replaces.
-_OPTIONS = ("timestep", "integrator", "cone", "impratio", "noslip_iterations")
+_OPTIONS = ("timestep", "integrator", "cone", "impratio", "noslip_iterations", "disableflags", "enableflags")
 
 
 class LinkGeom(NamedTuple):
@@ -47,7 +47,7 @@ def add_link_geoms(mjcf: Mjcf, robot: Robot) -> dict[str, LinkGeom]:
         usable = [g for g in geoms if not _is_field(source, g)]
         if not usable:
             continue
-        bodies[b] = xml_name(f"geoms of {link}")
+        bodies[b] = xml_name(f"geoms of {link} ({b})")
         body = mjcf.body(frame.parentJoint).add_body(name=bodies[b], **pose(frame.placement))
         for g in usable:
             names[g] = xml_name(f"geom {g} of {link}")
