@@ -110,7 +110,7 @@ study-elastic: $(VENV)/.installed-test
 
 study-global: $(VENV)/.installed-test
 	$(BIN)/python -m docs.studies global --write
-	$(BIN)/python -m docs.studies search --seed 1
+	$(BIN)/python -m docs.studies search --seed 1 --write
 
 study-feasible: $(VENV)/.installed-test
 	$(BIN)/python -m docs.studies feasible --write
