@@ -202,7 +202,7 @@ def lateral_force_range(model: pin.Model, propulsion: PropulsionSpec, q: ArrayLi
         raise PostureError("the base's x axis is vertical", where="lateral force", hint="give a level posture")
     forward /= np.linalg.norm(forward)
     left = np.array([-forward[1], forward[0], 0.0])
-    limits = np.asarray(model.effortLimit)[6:]
+    limits = torque_limits(model)[6:]
 
     def largest(direction: Array) -> float:
         push = mass_matrix[:, :3] @ (rotation.T @ direction)

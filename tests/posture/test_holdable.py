@@ -352,6 +352,13 @@ def test_data_that_say_nothing_leave_the_robot_alone() -> None:
         load_cases(posed.objective, posed.given, replace(posed.requirements, hold_force=1.0))
 
 
+def test_limits_of_sliding_joints_are_in_newtons() -> None:
+    rest = cases_of("tiago").cases[0].equilibrium
+    units = dict(zip(rest.actuators, rest.units, strict=True))
+    assert units["torso_lift_joint"] == "N" and units["arm_1_joint"] == "N·m"
+    assert set(cases_of("tilthex_arm").cases[0].equilibrium.units) == {"N", "N·m"}
+
+
 def test_a_payload_and_a_force_make_cases_of_their_own() -> None:
     more = {"payload": (("ee", 0.4),), "hold_force": 2.0}
     every = cases("tilthex_arm", **more)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -209,8 +210,18 @@ def test_weak_rotors_and_weak_joints_are_named(model: pin.Model, propulsion: Pro
     limp.effortLimit = effort
     result = hover(limp, propulsion, q)
     assert result.torque_margin < 0
-    assert any("shoulder_pitch" in v for v in result.violations)
+    line = r"shoulder_pitch would need \S+ N·m, above its limit 0\.1 N·m"
+    assert any(re.fullmatch(line, violation) for violation in result.violations)
     assert lateral_force_range(limp, propulsion, q).forward != lateral_force_range(model, propulsion, q).forward
+
+
+def test_a_limit_of_zero_is_not_known(model: pin.Model, propulsion: PropulsionSpec) -> None:
+    unknown, q = pin.Model(model), model.referenceConfigurations["home"]
+    unknown.effortLimit = np.zeros(model.nv)
+    held = hover(unknown, propulsion, q)
+    assert held.feasible and held.torque_margin == 1
+    free, bounded = (lateral_force_range(each, propulsion, q) for each in (unknown, model))
+    assert all(getattr(free, side) >= getattr(bounded, side) - 1e-9 > 0 for side in vars(free))
 
 
 def test_bad_input(model: pin.Model, propulsion: PropulsionSpec) -> None:
