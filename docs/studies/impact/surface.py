@@ -57,17 +57,13 @@ class Measured:
     """Measurements of one impact."""
 
     jump: Vector  # velocity jump Δν in the coordinates of Pinocchio, shape (nv,)
+    size: float  # norm of the jump, without joints that follow others
     restitution: float  # normal speed after the impact divided by the speed before
     slip: float  # tangential speed of the contact point after the impact, divided by v_n
     impulse: float  # impulse of the surface along n, N s
     loss: float  # kinetic energy lost, J
     duration: float  # time from touch to the last force, s
     feet: float  # largest speed of a support after the impact, divided by v_n
-
-    @property
-    def size(self) -> float:
-        """Norm of the jump, ``‖Δν‖``."""
-        return float(np.linalg.norm(self.jump))
 
 
 class NoImpact(Exception):
@@ -89,10 +85,13 @@ class Scene:
         self._robot, self._q, self._objective = objective.robot, q, objective
         # Copy the values of the oracle at this posture, because the oracle is reused for other postures.
         oracle = objective.oracle.at(q)
-        self._M, self._J, self._Js, self._n = (np.array(x) for x in (oracle.M, oracle.J, oracle.Js, oracle.n))
+        self._J, self._Js, self._n = (np.array(x) for x in (oracle.J, oracle.Js, oracle.n))
+        self._M = Numeric(self._robot.model).at(q).mass_matrix()
         self._mobility = self._J @ oracle.solve(self._J.T)
         self._point, self._feet = oracle.point, oracle.feet
         written = build_mjcf(self._robot.model)
+        for c in self._robot.couplings:
+            written.couple(self._robot.joint_id(c.follower), self._robot.joint_id(c.leader), c.ratio, c.offset)
         self._layout = written.layout
         self._model = _with_surface(written, objective, q).compile()
         self._ball_body = int(self._model.geom("ball").bodyid[0])
@@ -113,7 +112,7 @@ class Scene:
         velocity = np.linalg.pinv(J, rcond=1e-9) @ wanted
         if np.abs(J @ velocity - wanted).max() > 1e-6:
             raise NoImpact("cannot move along the normal alone")
-        return np.asarray(velocity)
+        return np.asarray(self._robot.coupling_matrix @ velocity)
 
     def with_friction(self, friction: float) -> Vector:
         """Return the predicted jump per unit approach speed with friction, without rebound, shape (nv,)."""
@@ -194,6 +193,7 @@ class Scene:
         feet = [np.abs(numeric.jacobian(foot.point)[: foot.rows] @ after).max() for foot in self._feet]
         return Measured(
             jump=after - before,
+            size=float(np.linalg.norm((after - before)[~self._robot.followers])),
             restitution=normal / speed,
             slip=float(np.linalg.norm(moved - normal * self._n)) / speed,
             impulse=impulse,
