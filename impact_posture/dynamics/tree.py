@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations
 
 import casadi as ca
 import numpy as np
@@ -17,6 +18,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impact_posture.dynamics import tree_steps as step
+from impact_posture.dynamics.chart import JointSlot
 from impact_posture.dynamics.kinematics import ByJoint, Kinematics, PointOnLink
 from impact_posture.dynamics.repeated_limbs import RepeatedLimbs
 from impact_posture.dynamics.spatial import (
@@ -26,6 +28,7 @@ from impact_posture.dynamics.spatial import (
     inertia_to_parent,
     motion_to_child,
     spin_power,
+    symmetric,
     transposed_times,
 )
 
@@ -54,6 +57,21 @@ class Wrench:
 
 
 @dataclass(frozen=True, eq=False)
+class _Cluster:
+    """Joints at one parent link that move with the velocities ``shares · rates``: one joint, or leader and followers.
+
+    The sweeps handle a cluster as one joint, with stacked quantities of its links (constraint embedding, Jain 2012).
+    ``entries`` are the entries of the joints in ν, and ``S`` is their stacked motion subspace per rate.
+    """
+
+    parent: int
+    joints: list[int]
+    entries: list[int]
+    shares: ca.SX
+    S: ca.SX
+
+
+@dataclass(frozen=True, eq=False)
 class Response:
     """The response of the robot to a generalized force and wrenches, with spatial quantities in link coordinates.
 
@@ -73,21 +91,11 @@ class Response:
     passed: ByJoint
     wrenches: tuple[Wrench, ...]
 
-    def minus(self, factors: ca.SX, others: Sequence[Response]) -> Response:
-        """Subtract ``Σ factors[k] · others[k]``, for responses to generalized forces without wrenches."""
-
-        def part(name: str) -> ByJoint:
-            mine, theirs = getattr(self, name), [getattr(other, name) for other in others]
-            return {i: mine[i] - sum(factors[k] * their[i] for k, their in enumerate(theirs)) for i in mine}
-
-        a = self.a - ca.horzcat(*[other.a for other in others]) @ factors
-        return Response(a, part("velocities"), part("before"), part("forces"), part("passed"), self.wrenches)
-
 
 class Tree(Kinematics):
     """Dynamics of a model; most arguments are as for :class:`~impact_posture.dynamics.kinematics.Kinematics`.
 
-    ``couplings`` are (entry of the follower in ν, entry of the leader, ratio) of coupled joints, which
+    ``couplings`` are (entry of the follower in ν, entry of the leader, ratio) of coupled joints with one axis, which
     :meth:`respond` considers.
     """
 
@@ -101,7 +109,26 @@ class Tree(Kinematics):
         couplings: Sequence[Coupled] = (),
     ) -> None:
         super().__init__(model, q, chart_x, extra_inertia, limbs)
-        self._couplings = tuple(couplings)
+        parent_of = {slot.v.start: parent for slot, _, parent in self._joints}
+        beside = {f: (leader, ratio) for f, leader, ratio in couplings if parent_of[f] == parent_of[leader]}
+        members: dict[int, list[tuple[JointSlot, float]]] = {}
+        for slot in self.chart.slots:
+            leader, ratio = beside.get(slot.v.start, (slot.v.start, 1.0))
+            members.setdefault(leader, []).append((slot, ratio))
+        self._clusters = [
+            _Cluster(
+                parent_of[each[0][0].v.start],
+                [slot.index for slot, _ in each],
+                [k for slot, _ in each for k in range(slot.v.start, slot.v.stop)],
+                constant(np.vstack([ratio * np.eye(slot.kind.nv) for slot, ratio in each])),
+                constant(np.vstack([ratio * slot.kind.subspace for slot, ratio in each])),
+            )
+            for each in members.values()
+        ]
+        apart = [c for c in couplings if c[0] not in beside]
+        self._K = ca.SX(len(apart), self.nv)
+        for k, (follower, leader, ratio) in enumerate(apart):
+            self._K[k, follower], self._K[k, leader] = 1.0, -ratio
 
     def velocities(self, v: ca.SX) -> ByJoint:
         """Return the spatial velocity of every link, in link coordinates, for the generalized velocity ``v``."""
@@ -182,78 +209,88 @@ class Tree(Kinematics):
         return inertia_to_parent(inertia, self._rest[i], self._p[i], spin.cosine, spin.sine, axis=spin.axis)
 
     @cached_property
-    def _factor(self) -> dict[int, tuple[ca.SX, ...]]:
-        """For every joint ``(pivot, D⁻¹Uᵀ, I^a = I^A − U D⁻¹Uᵀ)`` with ``U = I^A S``, ``D = SᵀU + armature``.
+    def _factor(self) -> dict[_Cluster, tuple[ca.SX, ...]]:
+        """For every cluster ``(pivot, I^A, D⁻¹Uᵀ, I^A − U D⁻¹Uᵀ)`` with ``U = I^A S``, ``D = SᵀU + armature``.
 
-        ``I^A`` is the articulated inertia of the link (Featherstone 2008, chapter 7).  The pivot is ``1/D`` for a
-        joint with one axis, ``D`` for a joint with several axes, and zero for a locked joint (infinite ``D``).
+        ``I^A`` is the articulated inertia of the link (Featherstone 2008, chapter 7), block diagonal for several
+        links.  The pivot is ``1/D`` for one rate, ``D`` for a joint with several axes, and zero for a locked joint
+        (infinite ``D``).
         """
         articulated = dict(self._inertia)
-        factors: dict[int, tuple[ca.SX, ...]] = {}
-        for slot, i, parent in reversed(self._joints):
-            D = step.pivot(articulated[i], self._S[i], self.armature[slot.v])
+        factors: dict[_Cluster, tuple[ca.SX, ...]] = {}
+        for c in reversed(self._clusters):
+            inertia = ca.diagcat(*[articulated[i] for i in c.joints])
+            D = step.pivot(inertia, c.S, (c.shares * c.shares).T @ self.armature[c.entries])
             # Computed outside the templates, so that a constant D gives a constant factor 1/D instead of a division.
-            pivot = ca.SX(0) if slot.v.start in self.locked else 1 / D if slot.kind.nv == 1 else D
-            factors[i] = pivot, *step.reduce(articulated[i], self._S[i], pivot)
-            if parent:
-                articulated[parent] = articulated[parent] + self._inertia_to_parent(i, factors[i][2])
+            pivot = ca.SX(0) if c.entries[0] in self.locked else 1 / D if D.is_scalar() else D
+            factors[c] = pivot, inertia, *step.reduce(inertia, c.S, pivot)
+            if c.parent:
+                _, _, gain, reduced = factors[c]
+                blocks, gains = ca.blocksplit(reduced, 6, 6), ca.vertsplit(gain.T, 6)
+                for k, i in enumerate(c.joints):
+                    articulated[c.parent] = articulated[c.parent] + self._inertia_to_parent(i, blocks[k][k])
+                for pair in combinations(zip(c.joints, gains, strict=True), 2):
+                    x, y = (force_to_parent(self._R[i], self._p[i], part) for i, part in pair)
+                    articulated[c.parent] = articulated[c.parent] - symmetric(D * x @ y.T + D * y @ x.T)
         return factors
 
     def respond(self, tau: ca.SX | None = None, wrenches: Sequence[Wrench] = ()) -> Response:
         """Solve ``M a = τ + Σ Jᵀ w`` by the articulated-body factorization in O(n), without computing ``M``.
 
-        The same sweeps give the force through joint i, ``f_i = I^a_i v_i⁻ + p^a_i``.  Couplings add a torque ``Kᵀμ``
-        such that ``K a = 0``, where each row of K is 1 at a follower and minus the ratio at its leader.
+        The same sweeps give the force through joint i, ``f_i = I^A_i v_i + p^A_i``.  Couplings between joints at
+        different links add a torque ``Kᵀμ`` such that ``K a = 0``, where each row of K is 1 at a follower and minus
+        the ratio at its leader.
         """
-        free = self._free_response(tau, wrenches)
-        if not self._couplings:
-            return free
-        gaps = ca.vertcat(*[self._gap(free, k) for k in range(len(self._couplings))])
-        return free.minus(step.solve(self._coupling_mobility, gaps), self._coupling_responses)
-
-    def _gap(self, response: Response, k: int) -> ca.SX:
-        follower, leader, ratio = self._couplings[k]
-        return response.a[follower] - ratio * response.a[leader]
+        if not self._coupling_responses:
+            return self._free_response(tau, wrenches)
+        tau = ca.SX(self.nv, 1) if tau is None else tau
+        # Without Kᵀμ, row k of K a is the product of τ + Σ Jᵀ w with column k of M⁻¹Kᵀ.
+        pushes = [(wrench.point.joint, self.link_force(wrench)) for wrench in wrenches]
+        gaps = [
+            ca.dot(tau, x.a) + sum(ca.dot(force, x.velocities[joint]) for joint, force in pushes)
+            for x in self._coupling_responses
+        ]
+        return self._free_response(tau - self._K.T @ step.solve(self._coupling_mobility, ca.vertcat(*gaps)), wrenches)
 
     @cached_property
     def _coupling_responses(self) -> list[Response]:
         """Responses ``M⁻¹Kᵀ`` to unit torques between each follower and its leader."""
-        responses = []
-        for follower, leader, ratio in self._couplings:
-            tau = ca.SX(self.nv, 1)
-            tau[follower], tau[leader] = 1.0, -ratio
-            responses.append(self._free_response(tau, ()))
-        return responses
+        return [self._free_response(row.T, ()) for row in ca.vertsplit(self._K)]
 
     @cached_property
     def _coupling_mobility(self) -> ca.SX:
         """``K M⁻¹Kᵀ``; for one coupling, its inverse."""
-        count = range(len(self._couplings))
-        mobility = ca.blockcat([[self._gap(self._coupling_responses[j], i) for j in count] for i in count])
+        mobility = self._K @ ca.horzcat(*[x.a for x in self._coupling_responses])
         return 1 / mobility if mobility.is_scalar() else mobility
 
     def _free_response(self, tau: ca.SX | None, wrenches: Sequence[Wrench]) -> Response:
-        """Return the response without couplings."""
+        """Return the response without couplings between joints at different links."""
         bias: ByJoint = dict.fromkeys(self._R, _ZERO)
         for wrench in wrenches:
             bias[wrench.point.joint] = bias[wrench.point.joint] - self.link_force(wrench)
-        drive: ByJoint = {}
+        driven: dict[_Cluster, tuple[ca.SX, ca.SX]] = {}
         passed: ByJoint = {}
-        for slot, i, parent in reversed(self._joints):
-            tau_i = tau[slot.v] if tau is not None else ca.SX(slot.kind.nv, 1)
-            drive[i], passed[i] = step.drive(self._S[i], tau_i, bias[i], self._factor[i][1])
-            if parent:
-                bias[parent] = bias[parent] + force_to_parent(self._R[i], self._p[i], passed[i])
+        for c in reversed(self._clusters):
+            tau_c = c.shares.T @ tau[c.entries] if tau is not None else ca.SX(c.S.size2(), 1)
+            stack = ca.vertcat(*[bias[i] for i in c.joints])
+            drive, pushed = step.drive(c.S, tau_c, stack, self._factor[c][2])
+            driven[c] = drive, stack
+            passed |= zip(c.joints, ca.vertsplit(pushed, 6), strict=True)
+            for i in c.joints if c.parent else ():
+                bias[c.parent] = bias[c.parent] + force_to_parent(self._R[i], self._p[i], passed[i])
         velocities: ByJoint = {}
         before: ByJoint = {}
         forces: ByJoint = {}
-        rates: ByJoint = {}
-        for _, i, parent in self._joints:
-            before[i] = motion_to_child(self._R[i], self._p[i], velocities.get(parent, _ZERO))
-            rates[i], velocities[i], forces[i] = step.respond(
-                before[i], self._S[i], drive[i], passed[i], *self._factor[i]
-            )
-        return Response(ca.densify(ca.vertcat(*rates.values())), velocities, before, forces, passed, tuple(wrenches))
+        a = ca.SX.zeros(self.nv)
+        for c in self._clusters:
+            start = velocities.get(c.parent, _ZERO)
+            before |= {i: motion_to_child(self._R[i], self._p[i], start) for i in c.joints}
+            stack = ca.vertcat(*[before[i] for i in c.joints])
+            rates, moved, through = step.respond(stack, c.S, *driven[c], *self._factor[c][:3])
+            a[c.entries] = c.shares @ rates
+            velocities |= zip(c.joints, ca.vertsplit(moved, 6), strict=True)
+            forces |= zip(c.joints, ca.vertsplit(through, 6), strict=True)
+        return Response(a, velocities, before, forces, passed, tuple(wrenches))
 
     def pair_gradient(self, x: Response, y: Response) -> ca.SX:
         """Return the tangent gradient of ``w_xᵀJ y + w_yᵀJ x − yᵀM x`` for fixed x, y, w_x and w_y, shape (nv,).
@@ -269,10 +306,10 @@ class Tree(Kinematics):
                 self._turn(turning, wrench, moved.velocities)
         rows: ByJoint = {}
         forces = [dict(x.forces), dict(y.forces)]
-        for i in x.forces:
-            spin = self._spin[i]
-            if spin is not None:
-                inertia = self._factor[i][2]
+        for c, (*_, inertia) in self._factor.items():
+            spin = self._spin[i := c.joints[0]]
+            # The force on one of several links also depends on the motion of the others.
+            if spin is not None and len(c.joints) == 1:
                 rows[i] = spin_power(inertia, x.before[i], y.before[i], axis=spin.axis, sense=spin.sense)
                 forces[0][i], forces[1][i] = x.passed[i], y.passed[i]
         return self._gather([(y.before, forces[0]), (x.before, forces[1])], turning, rows)

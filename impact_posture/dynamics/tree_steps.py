@@ -1,7 +1,8 @@
 """Operations at one joint in a sweep over the kinematic tree.
 
 Notation follows Featherstone (2008).  ``S`` is the motion subspace of the joint, shape (6, nv), and ``I`` the
-articulated inertia of its link.  ``pivot`` is ``D = SᵀIS + armature``, or ``1/D`` for a joint with one axis.
+articulated inertia of its link.  ``pivot`` is ``D = SᵀIS + armature``, or ``1/D`` for a joint with one axis.  For
+coupled joints at one link, all quantities of their links are stacked, and ``nv`` is 1.
 """
 
 from __future__ import annotations
@@ -34,15 +35,16 @@ def drive(S: ca.SX, tau: ca.SX, bias: ca.SX, gain: ca.SX) -> tuple[ca.SX, ...]:
 
 @template
 def respond(
-    before: ca.SX, S: ca.SX, drive: ca.SX, passed: ca.SX, pivot: ca.SX, gain: ca.SX, reduced: ca.SX
+    before: ca.SX, S: ca.SX, drive: ca.SX, bias: ca.SX, pivot: ca.SX, inertia: ca.SX, gain: ca.SX
 ) -> tuple[ca.SX, ...]:
     """Return the joint velocity, the velocity of the link after the joint, and the force through the joint.
 
-    ``before`` is the velocity of the link without the motion of the joint.  The other arguments are results of
-    :func:`drive` and :func:`reduce`.
+    ``before`` is the velocity of the link without the motion of the joint, and ``bias`` is its bias force.  ``drive``
+    and ``gain`` are results of :func:`drive` and :func:`reduce`.
     """
     rates = solve(pivot, drive) - gain @ before
-    return rates, before + S @ rates, reduced @ before + passed
+    velocity = before + S @ rates
+    return rates, velocity, inertia @ velocity + bias
 
 
 @template

@@ -122,6 +122,44 @@ def test_gradients_and_the_exported_code_agree(tmp_path: Path, kind: str, metric
         assert_close(np.ravel(slope), objective.gradient(q), 1e-10, "C")
 
 
+@pytest.mark.parametrize("kind", ["prismatic", "revolute"])
+@pytest.mark.parametrize("frame", ["pillar", "tip", "c_finger"])
+def test_leader_and_followers_at_one_link(tmp_path: Path, kind: str, frame: str) -> None:
+    """Two arms on the ground and three fingers move together; two followers come before their leaders."""
+    masses = {
+        "stand": 5,
+        "counter": 3,
+        "pillar": 2,
+        "a_finger": 0.05,
+        "b_finger": 0.06,
+        "c_finger": 0.07,
+        "tip": 0.02,
+    }
+    fingers = [
+        joint(f"{k}_joint", f"pillar {k}_finger", axis, f"0.08 {y} 0.3", kind, FINGERS + more)
+        for k, axis, y, more in (
+            ("a", "0 -1 0", -0.01, mimic("b_joint", 1.5, 0.005)), ("b", "0 1 0", 0.01, ""),
+            ("c", "0.6 0 0.8", 0.0, mimic("b_joint", -0.7, 0.04)),
+        )
+    ]  # fmt: skip
+    loaded = load(
+        tmp_path, *[link(name, mass, "0.04 0.01 -0.02") for name, mass in masses.items()],
+        joint("counter", "stand counter", "0 0.6 0.8", more=MOVED + mimic("pillar", -0.5)),
+        joint("pillar", "stand pillar", "1 0 0", "0.1 0 0.2"), *fingers,
+        joint("tip", "a_finger tip", "0 0 1", "0.05 0 0"), toml="[armature]\ndefault = 0.01\n",
+    )  # fmt: skip
+    assert {(c.follower, c.leader) for c in loaded.couplings} == {
+        ("counter", "pillar"), ("a_joint", "b_joint"), ("c_joint", "b_joint")
+    }  # fmt: skip
+    objective = WorstCaseObjective(loaded, ImpactContact(frame, (0.0, 0.6, 0.8), (0.01, 0.0, 0.02)))
+    q = loaded.coupled(np.array([0.0, 0.4, 0.0, 0.3, 0.02, 0.0]))
+    value, gradient = objective.gradient_fun()(q, np.array(objective.contact.normal))
+    assert float(value) == pytest.approx(objective.value(q), rel=1e-12)
+    assert_close(np.array(gradient).ravel(), objective.gradient(q), 1e-11, "CasADi and Pinocchio")
+    differences = central_gradient(objective.value, loaded.model, q, 2e-4)
+    assert_close(np.array(gradient).ravel(), differences, 1e-8, "differences")
+
+
 def test_a_light_follower_changes_nothing_and_a_locked_one_locks_its_leader(tmp_path: Path) -> None:
     loaded = load(tmp_path, *gripper(), toml="[armature]\ndefault = 0.01\n")
     alone = load(tmp_path, *gripper(), lock=("right_joint",), toml="[armature]\ndefault = 0.01\n")
