@@ -117,13 +117,13 @@ class Tree(Kinematics):
             members.setdefault(leader, []).append((slot, ratio))
         self._clusters = [
             _Cluster(
-                parent_of[each[0][0].v.start],
+                parent_of[leader],
                 [slot.index for slot, _ in each],
                 [k for slot, _ in each for k in range(slot.v.start, slot.v.stop)],
                 constant(np.vstack([ratio * np.eye(slot.kind.nv) for slot, ratio in each])),
                 constant(np.vstack([ratio * slot.kind.subspace for slot, ratio in each])),
             )
-            for each in members.values()
+            for leader, each in members.items()
         ]
         apart = [c for c in couplings if c[0] not in beside]
         self._K = ca.SX(len(apart), self.nv)
