@@ -7,7 +7,7 @@ this module.  Geoms that collide with nothing are only visual, and only pictures
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
@@ -79,13 +79,21 @@ def disabled_bodies(model: Any) -> set[frozenset[str]]:
     As in MuJoCo, bodies without joints count as one body with their parents.
     """
     names = [object_name(model, "body", b) for b in range(model.nbody)]
-    pairs = {frozenset((names[s >> 16], names[s & 0xFFFF])) for s in map(int, model.exclude_signature)}
+    return {frozenset((names[a], names[b])) for a, b in excluded_pairs(model, range(model.nbody))}
+
+
+def excluded_pairs(model: Any, bodies: Iterable[int]) -> set[tuple[int, int]]:
+    """Return the excluded pairs of bodies, and the pairs of ``bodies`` in one rigid group or in consecutive groups.
+
+    A rigid group is a body with joints and the bodies without joints that it carries.
+    """
     weld = np.asarray(model.body_weldid)
     parent = weld[np.asarray(model.body_parentid)[weld]]
-    for a, b in combinations(range(model.nbody), 2):
-        if weld[a] == weld[b] or parent[a] == weld[b] or parent[b] == weld[a]:
-            pairs.add(frozenset((names[a], names[b])))
-    return pairs
+    return {(s >> 16, s & 0xFFFF) for s in map(int, model.exclude_signature)} | {
+        (a, b)
+        for a, b in combinations(bodies, 2)
+        if weld[a] == weld[b] or parent[a] == weld[b] or parent[b] == weld[a]
+    }
 
 
 def _shape(model: Any, g: int, name: str, body: str, *, hull: bool) -> MjcfShape:
@@ -102,7 +110,7 @@ def _shape(model: Any, g: int, name: str, body: str, *, hull: bool) -> MjcfShape
     }
     if kind not in known:
         raise UnusableShape(f"a {kind} is not a shape of a link; give {', '.join(known)}")
-    surface = _mesh(model, int(model.geom_dataid[g])) if kind == "mesh" else _NO_MESH
+    surface = mesh_surface(model, int(model.geom_dataid[g])) if kind == "mesh" else _NO_MESH
     surface = hull_surface(surface[0]) if kind == "mesh" and hull else surface
     at, color = placement(model.geom_pos[g], model.geom_quat[g]), _color(model, g)
     return MjcfShape(name, body, at, kind, known[kind], color=color, surface=surface)
@@ -116,6 +124,7 @@ def _color(model: Any, g: int) -> tuple[float, ...]:
     return tuple(float(v) for v in color)
 
 
-def _mesh(model: Any, k: int) -> tuple[Array, Triangles]:
+def mesh_surface(model: Any, k: int) -> tuple[Array, Triangles]:
+    """Return the corners, m, shape (n, 3), and the triangles, shape (m, 3), of a mesh."""
     corners = model.mesh_vert[model.mesh_vertadr[k] :][: model.mesh_vertnum[k]]
     return corners.astype(float), model.mesh_face[model.mesh_faceadr[k] :][: model.mesh_facenum[k]].astype(int)

@@ -11,6 +11,7 @@ import pinocchio as pin
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
+from impact_posture.errors import listed
 from impact_posture.simulation.metrics import Metrics
 from impact_posture.simulation.recorder import feet_of
 from impact_posture.simulation.run import Run
@@ -127,8 +128,7 @@ def _links_touch(setup: Setup, runs: Iterable[Run]) -> Iterator[str]:
                 begins.setdefault(" and ".join(sorted(labels[geom] for geom in pair)), float(t))
     if begins:
         pairs = [f"{pair} (t = {t:.2f} s)" for pair, t in sorted(begins.items(), key=lambda item: item[1])]
-        more = f" and {len(pairs) - _MOST} more pairs" if len(pairs) > _MOST else ""
-        yield f"links touched: {', '.join(pairs[:_MOST])}{more}"
+        yield f"links touched: {listed(pairs, _MOST)}"
 
 
 def _below(setup: Setup, q: Array, n: Array, point: Array) -> Flags:

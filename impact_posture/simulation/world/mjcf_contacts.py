@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from impact_posture.collision.mjcf_shapes import solid_geoms
+from impact_posture.collision.mjcf_shapes import excluded_pairs, mesh_surface, solid_geoms
 from impact_posture.dynamics.mjcf import Mjcf, pose
 from impact_posture.robot.mjcf_file import object_name
 from impact_posture.robot.mjcf_model import placement
@@ -61,7 +60,10 @@ def add_link_geoms(mjcf: Mjcf, robot: Robot) -> dict[str, LinkGeom]:
             body.add_geom(name=names[g], type=source.geom_type[g], size=source.geom_size[g], mass=0.0, **law, **at)
     # Locked joints merge bodies, so the bodies that are next to each other in the file are excluded one by one.
     mjcf.spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_FILTERPARENT
-    for first, second in _excluded(source):
+    parents_touch = source.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT
+    # Bodies that are fixed to the world collide with the bodies next to them.
+    moving = [] if parents_touch else np.flatnonzero(source.body_weldid).tolist()
+    for first, second in excluded_pairs(source, moving):
         if first in bodies and second in bodies:
             mjcf.spec.add_exclude(bodyname1=bodies[first], bodyname2=bodies[second])
     for p in range(source.npair):
@@ -93,23 +95,9 @@ def _is_field(model: Any, g: int) -> bool:
     return bool(model.geom_type[g] == types.mjGEOM_HFIELD or model.geom_type[g] == types.mjGEOM_SDF)
 
 
-def _excluded(model: Any) -> set[tuple[int, int]]:
-    """Return the pairs of bodies that MuJoCo does not let collide, apart from bodies without joints between them."""
-    pairs = {(s >> 16, s & 0xFFFF) for s in map(int, model.exclude_signature)}
-    if model.opt.disableflags & import_mujoco().mjtDisableBit.mjDSBL_FILTERPARENT:
-        return pairs
-    weld = np.asarray(model.body_weldid)
-    parent = weld[np.asarray(model.body_parentid)[weld]]
-    # Bodies that are fixed to the world collide with the bodies next to them.
-    moving = np.flatnonzero(weld)
-    return pairs | {
-        (int(a), int(b)) for a, b in combinations(moving, 2) if parent[a] == weld[b] or parent[b] == weld[a]
-    }
-
-
 def _hull(model: Any, mesh: int) -> Array:
     """Return the corners of the convex hull with which a mesh collides, m, shape (k, 3)."""
-    corners = np.array(model.mesh_vert[model.mesh_vertadr[mesh] :][: model.mesh_vertnum[mesh]], dtype=float)
+    corners, _ = mesh_surface(model, mesh)
     if model.mesh_graphadr[mesh] < 0:
         return corners
     graph = model.mesh_graph[model.mesh_graphadr[mesh] :]
