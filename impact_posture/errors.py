@@ -199,7 +199,7 @@ class UrdfError(InputError):
 
 
 class MjcfError(UrdfError):
-    """The MJCF cannot be compiled, or contains what a tree of independent joints cannot contain."""
+    """The MJCF cannot be compiled, or a tree of joints with couplings cannot represent its content."""
 
 
 class InertiaError(UrdfError):

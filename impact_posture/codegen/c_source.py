@@ -33,8 +33,8 @@ _SPILL = 2
 # while the block computes one group of configurations after the other.
 _BATCH_BLOCK = 60
 
-# Largest number of operations of a CUDA function whose blocks are inlined, so that its values can be in registers.
-# The compiler stores more values of a longer function in memory than its separate blocks store.
+# Up to this number of operations, the blocks of a CUDA function are inlined, so that its values can be in registers.
+# For longer functions, the compiler stores fewer values in memory if the blocks are separate functions.
 _INLINED = 6000
 # Largest number of statements in a block that is not inlined.  On an H100, talos in double precision reaches
 # 105 million evaluations/s with 600 statements, 95 with 300, and 91 with 200 or 1,000.
@@ -48,8 +48,8 @@ class CudaSource:
     Attributes:
         inlined: Whether the blocks are inlined.
         constants: Definitions of the tables of constants.
-        functions: Template variables of each function: those of :attr:`CSource.functions`, and ``blocks``, ``angles``
-            and ``work`` (length of the work array).
+        functions: Template variables of each function: as in :attr:`CSource.functions`, and also ``blocks``,
+            ``angles`` and ``work`` (length of the work array).
     """
 
     inlined: bool
@@ -177,8 +177,9 @@ def _cuda(
     for function, order in zip(library.functions, orders, strict=True):
         layout = lay_out(scalars, [function.outputs], block, order)
         emitter = Emitter(layout, f"{function.stem}_{function.name}", real, {1: real.name}, constants)
-        own = {"blocks": emitter.blocks, "angles": _angles(layout), "work": layout.sizes.get(1, 0)}
-        functions.append(_variables(function, emitter, [b.call for b in emitter.blocks], normals) | own)
+        variables = _variables(function, emitter, [b.call for b in emitter.blocks], normals)
+        work = layout.sizes.get(1, 0)
+        functions.append(variables | {"blocks": emitter.blocks, "angles": _angles(layout), "work": work})
     return CudaSource(inlined, constants.text({1: real.name}), tuple(functions))
 
 

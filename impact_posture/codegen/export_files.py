@@ -27,7 +27,7 @@ from impact_posture.version import __version__
 
 _WIDTH = 112
 # Number of threads in a block of the CUDA kernels.  The speed is the same from 32 to 256.
-_CUDA_BLOCK = 128
+_THREADS = 128
 
 
 class Verbatim(str):
@@ -157,7 +157,7 @@ def _context(
         "units": units,
         "unit_bounds": [real.literal(float(f"{(1 + sign * real.unit_tolerance) ** 2:.12f}")) for sign in (-1, 1)],
         "macros": SHORT_NAMES,
-        "block": _CUDA_BLOCK,
+        "block": _THREADS,
         "signatures": SIGNATURES,
         "sizes": sizes,
         "kernels": [

@@ -1,7 +1,7 @@
 """Order operations limb by limb, for processors with few registers.
 
 A sweep over the kinematic tree visits each limb once.  A limb has few values, and the body passes few values between
-limbs.  So few values must be kept at a time if each visit of a limb is computed in one piece.
+limbs.  Therefore, few values must be kept at a time if each visit of a limb is computed in one piece.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ _PATCH = 5e-4
 _SOLE = 0.02
 # Cosine of the largest tilt of a sole at the default posture, 10°.
 _UPRIGHT = float(np.cos(np.radians(10.0)))
-# Number of proportions of a sole that are compared.
+# Number of ratios of length and width that are tried for the rectangle in a sole.
 _PROPORTIONS = 180
 
 
@@ -42,7 +42,10 @@ def support(robot: Robot, frame: str, *, flat: bool) -> Support:
 
 
 def measured_sole(robot: Robot, foot: Support) -> Support:
-    """Return a foot with the size of its sole around its contact point; unchanged if it is not flat and below."""
+    """Return a foot with the size of its sole around its contact point.
+
+    A foot that is not flat, below its frame and upright is returned unchanged.
+    """
     sole = _lowest(robot, foot.frame, np.array([0.0, 0.0, 1.0]))
     x, y, _ = _rounded(np.append(_inner_rectangle(sole[:, :2] - foot.offset[:2]), 0.0))
     upright = _up(robot, foot.frame)[2] > _UPRIGHT
@@ -75,7 +78,7 @@ def _inner_rectangle(points: Array) -> Array:
     if edges is None or edges[1].min() <= 0:
         return np.zeros(2)
     angles = np.pi / 2 * np.arange(1, _PROPORTIONS) / _PROPORTIONS
-    # The rectangle of which a point is a corner is also compared, so that a rectangular sole is exact.
+    # Rectangles with a corner at a point are also tried, so that a rectangular sole is exact.
     proportions = np.hstack([[np.cos(angles), np.sin(angles)], np.abs(points.T) + 1e-9])
     halves = proportions * (edges[1][:, None] / (np.abs(edges[0]) @ proportions)).min(axis=0)
     return np.asarray(halves[:, halves.prod(axis=0).argmax()])

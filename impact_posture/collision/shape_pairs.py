@@ -22,7 +22,7 @@ from impact_posture.system.arrays import Array
 _POSTURES = 1000
 _COUNTED = 100
 _SEED = 0
-# Smallest singular value of the directions of sliding joints that are not parallel.
+# Sliding joints are parallel if all but one of the singular values of their directions are at most this value.
 _PARALLEL = 1e-6
 
 Pair = tuple[int, int]
@@ -74,8 +74,8 @@ def touching_by_design(robot: Robot, shapes: Sequence[pin.GeometryObject], pairs
 def _telescopic(jacobians: Array, columns: Sequence[range], first: set[int], second: set[int]) -> bool:
     """Return whether one joint carries the other, and all joints between them slide along the same direction.
 
-    ``first`` and ``second`` are the joints that move a joint, with this joint.  ``jacobians``, shape (6, nv), contain
-    the ``columns`` of each joint.
+    ``first`` and ``second`` each contain a joint and all joints that carry it.  ``columns`` are the columns of each
+    joint in ``jacobians``, shape (6, nv).
     """
     if not (first < second or second < first):
         return False

@@ -210,7 +210,10 @@ def _head(mesh: Path) -> bytes:
 
 
 def _root_transform(mesh: Path | None) -> Array | None:
-    """Return the transform of the single root node of a glTF file, shape (4, 4), which coal leaves out."""
+    """Return the transform of the single root node of a glTF file, which coal leaves out, shape (4, 4).
+
+    Return ``None`` for other files, and for a root node that coal reads correctly.
+    """
     if mesh is None or mesh.suffix.lower() not in (".gltf", ".glb"):
         return None
     data = mesh.read_bytes()

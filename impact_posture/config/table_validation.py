@@ -16,7 +16,7 @@ from impact_posture.system.text_files import read_text
 _Table = TypeVar("_Table")
 
 
-# A line of YAML that cannot begin a line of TOML outside of a text: ``key: value`` or ``- item``.
+# A line that is YAML and cannot be TOML: ``key: value`` or ``- item``.
 _YAML_LINE = re.compile(r"^ *(?:- )?[\w-]+:(?: |$)|^ *- ", re.MULTILINE)
 
 

@@ -1,1 +1,1 @@
-"""Drafts of ``robot.toml`` from a URDF."""
+"""Drafts of ``robot.toml`` from a URDF or MJCF."""

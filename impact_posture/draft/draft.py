@@ -91,7 +91,7 @@ def draft_spec(located: Located, options: LoadOptions, folder: Path) -> Draft:
     if options.root:
         root, why = options.root, "as --root says"
     elif robot.mjcf is not None:
-        root, why = robot.root, "as the MJCF"
+        root, why = robot.root, "as in the MJCF"
     else:
         root, why = guess.likely_root(robot, feet, srdf)
     if root != robot.root:

@@ -142,8 +142,8 @@ def couple_limits(model: pin.Model, couplings: Iterable[JointCoupling]) -> list[
                 low[lead], high[lead] = max(low[lead], ends[0]), min(high[lead], ends[1])
             else:
                 stated, other = f"[{low[f]:g}, {high[f]:g}]", f"[{low[lead]:g}, {high[lead]:g}]"
-                fault = f"the position limits {stated} of '{c.follower}' leave '{c.leader}' {other}, which it mimics"
-                warnings.append(f"{fault}, no range, so they are not used")
+                fault = f"the position limits {stated} of '{c.follower}' contradict the limits {other} of its leader"
+                warnings.append(f"{fault} '{c.leader}', so the limits of '{c.follower}' are not used")
         f, lead = _in_v(model, c.follower), _in_v(model, c.leader)
         if 0 < fast[f] < ENDLESS:
             limit = fast[f] / abs(c.ratio)

@@ -1,4 +1,4 @@
-"""Compile an MJCF with the compiler of MuJoCo, and refuse what a tree with coupled joints cannot contain."""
+"""Compile an MJCF with the compiler of MuJoCo, and refuse content that a tree of joints cannot represent."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from impact_posture.config.problem_settings import Root
-from impact_posture.errors import MjcfError
+from impact_posture.errors import MjcfError, listed
 from impact_posture.robot.joint_coupling import JointCoupling, composed
 from impact_posture.robot.urdf import MOST_DEGREES_OF_FREEDOM
 from impact_posture.system.arrays import Array
@@ -31,7 +31,7 @@ class MjcfFile(NamedTuple):
     """A compiled MJCF.
 
     Attributes:
-        model: The ``mujoco.MjModel`` on the chosen root.
+        model: The ``mujoco.MjModel`` with the chosen root.
         root: ``free-flyer`` if the model has a free joint, else ``fixed``.
         keyframes: Name of a keyframe → name of a joint → its entries in ``qpos``.
         couplings: Couplings of joints by equality constraints.
@@ -122,9 +122,8 @@ def _compile(spec: Any, path: Path) -> tuple[Any, list[str]]:
             spec.delete(asset)
     for skin in list(spec.skins):
         spec.delete(skin)
-    files = sorted(missing.values())
-    more = f" and {len(files) - 1} more" if files[1:] else ""
-    return spec.compile(), [f"no mesh '{files[0]}'{more}: their shapes are left out; inertias are stated"]
+    files = listed([f"'{file}'" for file in sorted(missing.values())], 1)
+    return spec.compile(), [f"no mesh {files}: their shapes are left out; inertias are stated"]
 
 
 def _asset(spec: Any, asset: Any) -> Path:
@@ -259,7 +258,7 @@ def _coupling_armatures(model: Any) -> Iterator[str]:
 
 
 def _left_out(model: Any) -> Iterator[str]:
-    """Yield a line about everything in the file that the model of an impact does not contain."""
+    """Yield one line that counts the parts of the file that the model of an impact leaves out; none without parts."""
     mujoco = import_mujoco()
     balls = (model.jnt_type == mujoco.mjtJoint.mjJNT_BALL) & (model.jnt_limited > 0)
     tendons = (model.tendon_stiffness > 0) | (model.tendon_limited > 0) | (model.tendon_damping > 0)

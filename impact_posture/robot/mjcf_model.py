@@ -133,7 +133,7 @@ def _set_limits(model: pin.Model, mjcf: Any) -> None:
 def _efforts(mjcf: Any) -> list[float]:
     """Return the largest torque (N·m) or force (N) of each joint in both directions; infinite if not stated.
 
-    The limits of the actuators of a joint add up, and ``actfrcrange`` limits their sum.
+    The limits of the actuators of a joint add up, and ``actuatorfrcrange`` limits their sum.
     """
     efforts, drives = [], [a for a in range(mjcf.nu) if drives_joint(mjcf, a) and mjcf.actuator_gear[a, 0]]
     for j in range(mjcf.njnt):

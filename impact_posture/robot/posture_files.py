@@ -171,7 +171,7 @@ def _by_name(robot: Robot, q: Array, data: Mapping[str, object], where: str) -> 
 
 
 def _check_same(robot: Robot, q: Array, named: Array, where: str) -> None:
-    """Raise an error if a file gives two values for one entry of ``q``, because a user has edited only one."""
+    """Raise an error if a file gives different values for an entry of ``q``, for example after an edit of one."""
     for name, one, other in zip(robot.q_names, q, named, strict=True):
         if abs(one - other) > _SAME:
             fault = f"{name} is {one:.6g} in q, but {other:.6g} by its name"

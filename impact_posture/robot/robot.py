@@ -164,7 +164,7 @@ class Robot:
 
     @property
     def first_joint(self) -> int:
-        """Index of the first joint in ν, which is the number of velocity entries of a floating base."""
+        """Index of the first joint in ν: 6 with a floating base, else 0."""
         return 6 if self.floating else 0
 
     @cached_property
@@ -208,7 +208,7 @@ class Robot:
         return [k for joint in self.held for k in range(self.nv)[v_slice(self.model, self.joint_id(joint))]]
 
     def fixed_with(self, hold: Sequence[str]) -> tuple[str, ...]:
-        """Return the joints that cannot move if the joints ``hold`` do not: also those with equal position limits."""
+        """Return ``hold``, the joints with equal position limits, and all joints that are coupled to them."""
         return with_partners(self.couplings, (*hold, *immovable_joints(self.model)))
 
     @property

@@ -42,7 +42,7 @@ class _Arguments(dict[str, str]):
 
 
 class _Packages:
-    """Folders of packages; ``known`` has those that are not below the ``folders`` or above the file ``path``."""
+    """Folders of packages: from ``known`` by name, below ``folders``, below a folder above ``path``, or from ROS."""
 
     def __init__(self, path: Path, folders: Sequence[Path], known: Mapping[str, str]) -> None:
         self._path, self._places, self._known = path, [*folders, *path.absolute().parents], known

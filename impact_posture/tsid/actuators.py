@@ -31,7 +31,7 @@ class Actuators:
         names: Names of the controls.
 
     Raises:
-        InputError: A joint follows another joint (:class:`JointCoupling`), and robot.toml does not hold them.
+        InputError: A joint follows another joint (:class:`JointCoupling`), and robot.toml does not hold both.
     """
 
     def __init__(self, robot: Robot) -> None:

@@ -188,7 +188,7 @@ def test_limits_of_a_follower_bound_its_leader(tmp_path: Path) -> None:
     # A range that leaves the leader none is not used, and equal limits are no limits.
     loaded, bounds = limits('lower="6" upper="7"')
     assert bounds == pytest.approx([-2.5, -4.9, 2.5, 5.1])
-    assert [line for line in loaded.warnings if "[6, 7] of 'b' leave 'a'" in line]
+    assert [line for line in loaded.warnings if "[6, 7] of 'b' contradict" in line]
     loaded, bounds = limits('lower="0" upper="0"')
     assert bounds == pytest.approx([-2.5, -4.9, 2.5, 5.1]) and not [w for w in loaded.warnings if "limits" in w]
 

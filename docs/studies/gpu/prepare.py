@@ -48,7 +48,7 @@ def write_samples(gradient: ImpactGradient, robot: Robot, path: Path) -> None:
     """Write random postures and normals, and H and ∇H of the C export: three sizes, then one row for each sample."""
     rng, start = np.random.default_rng(0), robot.posture()
     steps = rng.uniform(-1.0, 1.0, (_SAMPLES, robot.nv))
-    steps[:, : 6 if robot.floating else 0] *= np.pi / 2
+    steps[:, : robot.first_joint] *= np.pi / 2
     q = np.array([pin.integrate(robot.model, start, step) for step in steps])
     n = rng.normal(size=(_SAMPLES, 3))
     n /= np.linalg.norm(n, axis=1, keepdims=True)

@@ -258,7 +258,8 @@ def _bounds(robot: Robot, given: Array, requirements: Requirements) -> tuple[Arr
         if slot.name in requirements.hold:
             lower[slot.x] = upper[slot.x] = x[slot.x]
         elif slot.name in followers:
-            # The limits of the leader imply these.  Wider bounds are never active together with them.
+            # The limits of the leader imply the limits of the follower.  With wider bounds for the follower, only
+            # one of the two limits is active.
             lower[slot.x] -= margin + _WIDER
             upper[slot.x] += margin + _WIDER
         elif (lower[slot.x] > upper[slot.x]).any():

@@ -29,8 +29,9 @@ from impact_posture.system.arrays import Array, independent_rows, null_space
 _TRIAL, _SURVIVES = 0.05, 0.1
 # Number of random feasible postures at which ranks are compared.
 _SAMPLES = 4
-# Singular values up to this value are zero at a projected posture.  A violation of 1e-9 leaves its root, 3e-5, along
-# motions that the constraints block only to second order, for example a sway on legs without ankle roll.
+# Singular values up to this value count as zero at a projected posture, which violates the constraints by up to 1e-9.
+# Some motions are blocked only to second order, for example a sway on legs without ankle roll.  Their singular values
+# are then as large as the square root of the violation, 3e-5.
 _BLURRED = 5e-5
 
 

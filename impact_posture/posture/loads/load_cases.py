@@ -131,7 +131,7 @@ def load_cases(objective: Objective, q: Array, requirements: Requirements) -> Lo
 def _unlimited(robot: Robot) -> list[str]:
     """Return notes that name the joints whose torque is not checked, because no effort limit is known."""
     unlimited = np.isinf(torque_limits(robot.model)) & robot.projector.any(axis=0)
-    unlimited[: 6 if robot.floating else 0] = False
+    unlimited[: robot.first_joint] = False
     slots = [slot for slot in Chart.of(robot.model).slots if unlimited[slot.v].any()]
     driven = [slot.name for slot in slots if slot.kind.family in ("revolute", "continuous", "prismatic")]
     passive = [slot.name for slot in slots if slot.name not in driven]

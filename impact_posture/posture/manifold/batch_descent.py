@@ -1,11 +1,11 @@
 """Descend from many postures at once, on the equalities of a problem and within its joint limits.
 
 Each step is the sum of a quasi-Newton step (BFGS) in the tangent space of the equalities and of a Gauss–Newton step
-that returns to the equalities.  The Lagrangian ``m − λᵀc`` judges postures off the equalities, with the merit m, the
-equalities c and the least-squares multipliers λ.  To first order, it is the merit after the return, so a step needs a
-single evaluation.  The batch stays full, because a new descent can begin when another ends.  For an arm, a descent
-takes about 0.5 ms, and a run of IPOPT about 10 ms.  Clearances and loads have no batch function, so descents ignore
-them.
+that returns to the equalities.  Postures that violate the equalities are compared by the Lagrangian ``m − λᵀc``,
+with the merit m, the equalities c and the least-squares multipliers λ.  To first order, the Lagrangian is the merit
+after the return, so a step needs a single evaluation.  The batch stays full, because a new descent can begin when
+another ends.  For an arm, a descent takes about 0.5 ms, and a run of IPOPT about 10 ms.  Clearances and loads have no
+batch function, so descents ignore them.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from impact_posture.system.arrays import Array
 
 # Residual (m, rad) with which a descent may begin and end, and the largest residual of an accepted step.
 _NEAR, _DRIFT = 1e-4, 0.1
-# Number of Gauss–Newton steps from a drawn posture.
+# Largest number of Gauss–Newton steps from a random posture to the equalities.
 _PROJECTING = 10
 # First and largest trust radius (rad, m), and the radius below which a descent gives up.
 _FIRST, _LONGEST, _SHORTEST = 0.3, 0.6, 1e-6
@@ -40,11 +40,11 @@ class _Rows:
     """Arrays with a row for each posture."""
 
     def taken(self, rows: NDArray[np.bool_]) -> Self:
-        """Return the rows of a mask."""
+        """Return the rows at which a mask is true."""
         return type(self)(*[getattr(self, field.name)[rows] for field in fields(self)])
 
     def joined(self, other: Self) -> Self:
-        """Return the rows of both."""
+        """Return these rows, followed by the rows of ``other``."""
         pairs = ((getattr(self, field.name), getattr(other, field.name)) for field in fields(self))
         return type(self)(*[np.concatenate(pair) for pair in pairs])
 
@@ -60,7 +60,7 @@ class Ends(_Rows):
 
 @dataclass
 class _Points(_Rows):
-    """Postures, and what a step from each needs.
+    """Postures, and the values from which the next steps are computed.
 
     Attributes:
         x: Postures, shape (N, nx).
@@ -136,12 +136,12 @@ class BatchDescent:
         along = length[:, None] * s.direction
         point = self._points(np.clip(manifold.move(s.x, along + s.back), manifold.lower, manifold.upper))
         bound = s.merit + _SUFFICIENT * length * (s.direction * s.gradient).sum(axis=1)
-        # A posture whose residual is too large for the first order may first return.
+        # If the residual is too large for the first-order estimate, a step may raise the merit to reduce it.
         returned = (s.residual > _NEAR) & (point.residual < s.residual / 2)
         accepted = np.isfinite(point.merit) & (point.residual <= _DRIFT) & ((point.merit <= bound) | returned)
         grown = np.where(length < 1, np.minimum(2 * s.radius, _LONGEST), s.radius)
         s.radius = np.where(accepted, grown, _SHORTER * length * size)
-        # A rejected step also says how the gradient changes.
+        # A rejected step also shows how the gradient changes.
         change = np.where(np.isfinite(point.merit)[:, None], point.gradient - s.gradient, 0.0)
         s.hessian, s.fresh = _updated(s.hessian, s.fresh, along, change)
         for field in fields(point):

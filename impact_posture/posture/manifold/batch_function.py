@@ -117,7 +117,7 @@ class BatchFunction:
         inputs = [np.zeros((function.nnz_in(k), width)) for k in range(function.n_in())]
         outputs = [np.zeros((function.nnz_out(k), width)) for k in range(function.n_out())]
         calls, own = list[tuple[Callable[..., Any], tuple[Array, ...]]](), list(np.zeros((function.sz_w(), width)))
-        # The array that each register of the function currently stands for.
+        # For each register of the function, the array that currently contains its value.
         at, constants = [*own], dict[float, Array]()
         for code, sources, targets, constant in operations:
             if code == ca.OP_CONST:

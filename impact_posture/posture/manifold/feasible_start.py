@@ -225,7 +225,7 @@ def draw_ranges(problem: ConstrainedProblem, chart: Chart) -> DrawRanges:
 
 
 def near_steps(rng: np.random.Generator, shape: tuple[int, ...], base: int) -> Array:
-    """Draw tangent vectors to postures that are near, shape (..., nv); the first ``base`` entries are smaller."""
+    """Draw tangent vectors that lead to near postures, shape (..., nv); the first ``base`` entries are smaller."""
     step = rng.normal(size=shape) * rng.uniform(0.1, 0.8, (*shape[:-1], 1))
     step[..., :base] *= 0.2
     return np.asarray(step)

@@ -31,16 +31,16 @@ _WIDTH, _SLOWEST = 512, 1 / 16
 _WORK, _LEAST = 1_300_000, 16
 # Share of the new descents that are hops.
 _HOPPING = 0.75
-# The chance that a hop starts at an optimum falls with the rank of the optimum to the power of the first number, and,
-# after as many hops as the second number, with the square of its hops.
+# A hop starts at an optimum with a probability proportional to ``(1 + rank)^-_RANKED / (1 + hops / _TIRED)²``.  The
+# best optimum has the rank 0, and ``hops`` counts the earlier hops from this optimum.
 _RANKED, _TIRED = 0.7, 8
 # Shares of the joints to which a hop gives other values, rounded up, and the share of hops that take the values from
 # another optimum instead of random ones.
 _REDRAWN, _CROSSED = (0.1, 0.2, 0.3, 0.5), 0.6
 # Distance (rad, m) below which two ends are the same optimum if their merits differ by less than SAME_VALUE.
 _SAME = 0.05
-# The search stops when random postures and hops from worse ends reached the best merit this often, after at least the
-# second number of ends, and the last share of all ends did not lower it.
+# The search stops if random postures and hops from worse ends reached the best merit ``_HITS`` times, at least
+# ``_ENDS`` descents have ended, and the last ends, a share ``_IDLE`` of all, did not lower the best merit.
 _HITS, _ENDS, _IDLE = 12, 256, 0.5
 # Number of starts of IPOPT, half of them at the best ends and half at the most different good ends.  If descents
 # ignored no constraint, a third suffices.  The number, times the degrees of freedom, is limited by the second

@@ -34,7 +34,7 @@ class SingularTarget:
         name: Name of the constraint.
         rank: Largest rank of its Jacobian at the given postures.
         full_rank: Rank of its Jacobian at random postures.
-        bent: Joint positions that give the rank back, rad; empty if the target does not depend on the given posture.
+        bent: Joint positions at which the rank is full, rad; empty if the target is stated by the user.
     """
 
     name: str
@@ -47,7 +47,7 @@ class SingularTarget:
         """Description of the singularity."""
         return (
             f"{self.name} is held where the robot is singular (its Jacobian has the rank {self.rank} instead of "
-            f"{self.full_rank}, as of a stretched arm), so hardly any other posture is left"
+            f"{self.full_rank}, as for a stretched arm), so hardly any other posture is left"
         )
 
     @property

@@ -98,7 +98,7 @@ def build_scene(robot: Robot, scene: Scene, q: Array, throw: Throw | None = None
     hulls, rotor_link = _add_rotor_link(mjcf, robot)
     links = add_link_geoms(mjcf, robot)
     if robot.floating:
-        # A link with a shape touches surfaces with its shape.  Of a fixed robot, a surface may cut the base.
+        # A link with a shape of the scenario touches surfaces only with this shape.  A surface may cut a fixed base.
         shaped = {WORLD, *(point_on(robot, shape.frame).joint for shape in scene.shapes)}
         hulls += [geom for geom, link in links.items() if link.joint not in shaped]
     for surface in scene.surfaces:
