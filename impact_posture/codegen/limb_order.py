@@ -62,8 +62,8 @@ def _limbs(graph: Graph, order: Sequence[int], leaves: set[int], limb_of: Mappin
         if node.op == "in":
             limb[k] = limb_of[node.args[1]] if graph.inputs[node.args[0]] == "q" else 0
             continue
-        several = {limb[a] for a in node.operands} - {0}
-        limb[k] = several.pop() if len(several) == 1 else 0
+        limbs = {limb[a] for a in node.operands} - {0}
+        limb[k] = limbs.pop() if len(limbs) == 1 else 0
         for a in node.operands:
             users.setdefault(a, set()).add(k)
     for k in reversed(order):

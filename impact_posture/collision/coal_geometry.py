@@ -13,9 +13,9 @@ from impact_posture.collision.mjcf_shapes import mjcf_shapes
 from impact_posture.collision.shape_corners import Corrected, shape_points
 from impact_posture.collision.shape_pairs import disabled_links, pairs_apart
 from impact_posture.collision.urdf_shapes import (
+    LinkShape,
+    LinkShapes,
     UnusableShape,
-    UrdfShape,
-    UrdfShapes,
     largest_extent,
     left_out,
     read_urdf_shapes,
@@ -42,12 +42,12 @@ class Geometry(NamedTuple):
     warnings: tuple[str, ...]
 
 
-def read_shapes(robot: Robot, first: str = "collision") -> UrdfShapes:
+def read_shapes(robot: Robot, first: str = "collision") -> LinkShapes:
     """Return the shapes in the URDF or MJCF of a robot; ``first`` selects its ``collision`` or ``visual`` shapes."""
     return read_urdf_shapes(robot, first) if robot.mjcf is None else mjcf_shapes(robot.mjcf.model, first)
 
 
-def load_geometry(robot: Robot, described: list[UrdfShape]) -> Geometry:
+def load_geometry(robot: Robot, described: list[LinkShape]) -> Geometry:
     """Load the shapes in a URDF; leave out unusable shapes with a warning."""
     model, largest = robot.model, largest_extent(robot)
     kept, solids, warnings = [], [], []
@@ -79,7 +79,7 @@ def load_geometry(robot: Robot, described: list[UrdfShape]) -> Geometry:
 
 
 def _placed(
-    model: pin.Model, shapes: list[UrdfShape], solids: list[Any], *, turned: bool
+    model: pin.Model, shapes: list[LinkShape], solids: list[Any], *, turned: bool
 ) -> list[pin.GeometryObject]:
     """Return the shapes at their joints; ``turned`` rotates meshes whose files state that the y axis is up.
 
@@ -109,7 +109,7 @@ def _gaps(model: pin.Model, objects: list[pin.GeometryObject]) -> float:
     return total
 
 
-def geometry_key(robot: Robot, described: list[UrdfShape]) -> str:
+def geometry_key(robot: Robot, described: list[LinkShape]) -> str:
     """Return a hash of all data that determine the swept hulls of a robot and the pairs that must not touch."""
     content = [coal.__version__, robot.kinematics_sha256]
     for shape in described:

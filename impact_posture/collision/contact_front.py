@@ -13,7 +13,7 @@ import pinocchio as pin
 from impact_posture.collision.coal_geometry import geometry_key, load_geometry, read_shapes
 from impact_posture.collision.shape_corners import ends, shape_points
 from impact_posture.collision.swept_hull import hull_corners
-from impact_posture.collision.urdf_shapes import UrdfShape
+from impact_posture.collision.urdf_shapes import LinkShape
 from impact_posture.config.cached_values import StoredArray, cached
 from impact_posture.config.demand import Vector3
 from impact_posture.robot.model_joints import rigid_groups
@@ -146,7 +146,7 @@ def _joint(robot: Robot, link: str) -> int:
     return int(robot.model.frames[robot.model.getFrameId(link, pin.FrameType.BODY)].parentJoint)
 
 
-def _silhouettes(robot: Robot, described: list[UrdfShape]) -> tuple[Silhouette, ...]:
+def _silhouettes(robot: Robot, described: list[LinkShape]) -> tuple[Silhouette, ...]:
     loaded, result = load_geometry(robot, described), []
     for link, solid in zip(loaded.links, loaded.model.geometryObjects, strict=True):
         shape, at = solid.geometry, solid.placement

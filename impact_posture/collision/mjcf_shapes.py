@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from impact_posture.collision.shape_corners import Corrected, Triangles, hull_surface, triangle_mesh
-from impact_posture.collision.urdf_shapes import UnusableShape, UrdfShape, UrdfShapes, left_out
+from impact_posture.collision.urdf_shapes import LinkShape, LinkShapes, UnusableShape, left_out
 from impact_posture.robot.mjcf_file import is_floating, object_name
 from impact_posture.robot.mjcf_model import placement
 from impact_posture.system.arrays import Array
@@ -25,7 +25,7 @@ _NO_MESH = np.zeros((0, 3)), np.zeros((0, 3), dtype=int)
 
 
 @dataclass(frozen=True, eq=False)
-class MjcfShape(UrdfShape):
+class MjcfShape(LinkShape):
     """A geom of an MJCF; ``surface`` has the corners, m, shape (k, 3), and the triangles, shape (n, 3), of a mesh."""
 
     surface: tuple[Array, Triangles] = _NO_MESH
@@ -44,12 +44,12 @@ class MjcfShape(UrdfShape):
         return Corrected(triangle_mesh(*self.surface), True)
 
 
-def mjcf_shapes(model: Any, first: str = "collision") -> UrdfShapes:
+def mjcf_shapes(model: Any, first: str = "collision") -> LinkShapes:
     """Return the solid geoms of an ``MjModel``; with ``first="visual"``, the visual geoms of bodies that have any.
 
     The world of a fixed robot has the shapes of its base.  The surroundings of a floating robot are not its shapes.
     """
-    read = UrdfShapes([], [], [])
+    read = LinkShapes([], [], [])
     for b, solid in solid_geoms(model):
         geoms = range(model.body_geomadr[b], model.body_geomadr[b] + model.body_geomnum[b])
         visual = [g for g in geoms if g not in solid] if first == "visual" else []

@@ -15,7 +15,7 @@ from impact_posture.collision.hull_bodies import Body, merged_bodies
 from impact_posture.collision.joint_planes import JointPlanes, joint_planes
 from impact_posture.collision.shape_pairs import Pair, nested_pairs, pairs_of, touch_of, touching_by_design
 from impact_posture.collision.swept_hull import Fit, SweptHull, fit_hull
-from impact_posture.collision.urdf_shapes import UrdfShape
+from impact_posture.collision.urdf_shapes import LinkShape
 from impact_posture.config.cached_values import StoredArray, cached
 from impact_posture.errors import listed, one_line
 from impact_posture.robot.robot import Robot
@@ -80,7 +80,7 @@ class _Source:
 
     key: str
     robot: Robot = field(compare=False)
-    described: list[UrdfShape] = field(compare=False)
+    described: list[LinkShape] = field(compare=False)
     warnings: tuple[str, ...]
     links: tuple[str, ...]
 
@@ -145,7 +145,7 @@ def _shapes(source: _Source) -> RobotShapes:
     return RobotShapes(**vars(fitted) | {"warnings": warnings}, robot=source.robot, without_shapes=bare)
 
 
-def fit_shapes(robot: Robot, described: list[UrdfShape]) -> FittedShapes:
+def fit_shapes(robot: Robot, described: list[LinkShape]) -> FittedShapes:
     """Load shapes, fit hulls, and determine the pairs that must not touch and the bounds for nested bodies."""
     tell("fitting collision shapes")
     loaded = load_geometry(robot, described)

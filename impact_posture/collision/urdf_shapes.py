@@ -53,16 +53,16 @@ _SIZES = {
 }
 
 
-class UrdfShapes(NamedTuple):
-    """The shapes in a URDF.
+class LinkShapes(NamedTuple):
+    """The shapes in a URDF or MJCF.
 
     Attributes:
         shapes: Shapes whose description can be used.
         warnings: A warning for each shape whose description cannot be used.
-        described: Links for which the URDF describes a shape, even if no shape of the link can be used.
+        described: Links for which the file describes a shape, even if no shape of the link can be used.
     """
 
-    shapes: list[UrdfShape]
+    shapes: list[LinkShape]
     warnings: list[str]
     described: list[str]
 
@@ -72,15 +72,15 @@ class UnusableShape(Exception):
 
 
 @dataclass(frozen=True)
-class UrdfShape:
-    """A shape in a URDF.
+class LinkShape:
+    """A shape of a link in a URDF or MJCF.
 
     Attributes:
         name: Unique name: the link, with ``[k]`` if the link has several shapes.
         placement: Placement in the axes of the link.
-        kind: Tag of the URDF, such as ``box`` or ``mesh``.
+        kind: Tag of the URDF or type of the geom, such as ``box`` or ``mesh``.
         sizes: Sizes in the order of the URDF, m, or the scale of a mesh.
-        color: Red, green, blue and opacity, 0 to 1; ``None`` if the URDF contains no color.
+        color: Red, green, blue and opacity, 0 to 1; ``None`` if the file contains no color.
     """
 
     name: str
@@ -166,7 +166,7 @@ def largest_extent(robot: Robot) -> float:
     return max(_LARGEST, _LARGEST_SHARE * float(np.linalg.norm(np.ptp(np.array(points), axis=0))))
 
 
-def read_urdf_shapes(robot: Robot, first: str = "collision") -> UrdfShapes:
+def read_urdf_shapes(robot: Robot, first: str = "collision") -> LinkShapes:
     """Read the shapes in the URDF of a robot.
 
     ``first`` selects the shapes of a link that has both ``collision`` and ``visual`` shapes.
@@ -175,12 +175,12 @@ def read_urdf_shapes(robot: Robot, first: str = "collision") -> UrdfShapes:
         UrdfError: The URDF has become unreadable, or its links differ from the links of the robot.
     """
     if robot.settings is None:
-        return UrdfShapes([], [], [])
+        return LinkShapes([], [], [])
     located = locate(robot.settings.robot, robot.settings)
     folders = [Path(folder).expanduser() for folder in robot.settings.package_dir]
     folders += [located.folder / Path(folder).expanduser() for folder in located.spec.model.package_dirs]
     folders += [Path(folder) for folder in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if folder]
-    read = UrdfShapes([], [], [])
+    read = LinkShapes([], [], [])
     root = parse_urdf(located.urdf)
     colors = {tag.get("name", ""): tag for tag in root.findall("material")}
     for link in root.iter("link"):
@@ -241,7 +241,7 @@ def left_out(name: str, fault: UnusableShape) -> str:
 
 def _read(
     tag: ET.Element, name: str, link: str, urdf: Path, folders: Sequence[Path], colors: Mapping[str, ET.Element]
-) -> UrdfShape:
+) -> LinkShape:
     shape = next(iter(tag.findall("geometry/*")), None)
     if shape is None or shape.tag not in _SIZES:
         known = ", ".join(_SIZES)
@@ -260,7 +260,7 @@ def _read(
     placement = pin.SE3(pin.rpy.rpyToMatrix(np.array(rpy)), np.array(xyz))
     mesh = _find_mesh(shape.get("filename", ""), urdf, folders) if shape.tag == "mesh" else None
     material = tag.find("material")
-    return UrdfShape(name, link, placement, shape.tag, tuple(sizes), mesh, _color(material, colors))
+    return LinkShape(name, link, placement, shape.tag, tuple(sizes), mesh, _color(material, colors))
 
 
 def _color(material: ET.Element | None, named: Mapping[str, ET.Element]) -> tuple[float, ...] | None:

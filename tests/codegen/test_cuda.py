@@ -51,7 +51,7 @@ inline void sincosf_(float angle, float *sine, float *cosine) { *sine = sinf(ang
 
 
 def on_host(written: Export, objectives: list[WorstCaseObjective]) -> ctypes.CDLL:
-    """Compile the device code as C++.  The library has the names of the C export; its batch calls the kernel."""
+    """Compile the device code as C++.  The names are as in the C export, and the batch function calls the kernel."""
     compiler = cxx_compiler()
     if compiler is None:
         pytest.skip("no C++ compiler")

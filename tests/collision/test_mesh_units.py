@@ -105,7 +105,7 @@ def write_gltf(path: Path, root: dict[str, object]) -> None:
 
 
 def extents(folder: Path, mesh: str, scale: str = "") -> tuple[Array, tuple[str, ...]]:
-    """Return the edge lengths of a mesh as a collision shape, m, and the warnings; the drawn mesh has to agree."""
+    """Return the edge lengths of a collision mesh, m, and the warnings; check that the drawn mesh agrees."""
     described = f'<geometry><mesh filename="{mesh}"{scale}/></geometry>'
     urdf = folder / "robot.urdf"
     urdf.write_text(

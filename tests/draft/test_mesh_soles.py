@@ -67,7 +67,7 @@ def test_a_mesh_gives_the_same_sole_as_a_box(tmp_path: Path, foot: str, mesh: Ar
 
 
 def test_the_rectangle_of_a_sole_lies_in_the_sole(tmp_path: Path) -> None:
-    """A toe of half the width leaves a rectangle of half the width at full length: every shorter one is smaller."""
+    """With a toe of half the width, the largest rectangle has half the width of the sole and its full length."""
     left, right = drafted(tmp_path, MESH.format(""), taper(SOLE)).supports
     np.testing.assert_allclose(left.size, [0.1, 0.02], rtol=0.02)
     assert left.size == right.size

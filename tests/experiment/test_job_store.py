@@ -14,7 +14,7 @@ from typing import Any
 import pinocchio as pin
 import pytest
 
-from impact_posture.collision.urdf_shapes import UrdfShape
+from impact_posture.collision.urdf_shapes import LinkShape
 from impact_posture.errors import ControllerNotFound, OutputError, ScenarioNotFound, SimulationDiverged
 from impact_posture.experiment import job_store
 from impact_posture.experiment.experiment_folders import draw_side_by_side, store_beside
@@ -101,7 +101,7 @@ def test_a_changed_input_runs_the_job_again(
     q = controller_factory(str(push)).setup.q.copy()
     posture.write_text(json.dumps({"q": q.tolist()}))
     mesh.write_text("v 0 0 0")
-    shape = UrdfShape("ball", "base_link", pin.SE3.Identity(), "mesh", (1.0, 1.0, 1.0), mesh)
+    shape = LinkShape("ball", "base_link", pin.SE3.Identity(), "mesh", (1.0, 1.0, 1.0), mesh)
     monkeypatch.setattr(job_store, "read_shapes", lambda robot: ([shape], []))
     job = Job(str(path), "nominal")
     store.keep(job, {"metrics": {}})

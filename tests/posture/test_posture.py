@@ -319,7 +319,7 @@ def test_singular_start_drops_no_equation(more: dict) -> None:
 
 
 def test_legs_without_ankle_roll_get_regular_equalities(tmp_path: Path) -> None:
-    """Such legs allow a sway to first order, as on H1, so one of twelve equations is redundant in every posture."""
+    """Legs without ankle roll, as on H1, allow a sway to first order, so one of twelve equations is redundant."""
     sole = '<collision><origin xyz="0.02 0 -0.045"/><geometry><box size="0.2 0.08 0.03"/></geometry></collision>'
     (tmp_path / "biped.urdf").write_text(biped(sole, ankle_roll=False))
     supports = "".join(

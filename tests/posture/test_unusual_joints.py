@@ -142,7 +142,7 @@ def coupled_gripper(folder: Path, frame: str = "right", **settings: Any) -> Cons
 
 
 def test_the_motor_of_the_leader_carries_its_followers(tmp_path: Path) -> None:
-    """The torques at rest are those of Pinocchio's model with mimic joints."""
+    """The torques at rest equal the torques of a Pinocchio model with mimic joints."""
     problem = coupled_gripper(tmp_path)
     reference = pin.buildModelFromUrdf(str(tmp_path / "written.urdf"), mimic=True)
     q = problem.robot.coupled(np.array([-0.4, 1.1, 0.3, 0.02, 0.0]))

@@ -51,7 +51,7 @@ def gripper(kind: str = "prismatic", phalanx: str = mimic("right_joint", -2.0, 0
 
 
 def reduced_metric(model: pin.Model, q: Vector, frame: int, offset: Vector, n: Vector, armature: Vector) -> float:
-    """Return ``nᵀJM⁻²Jᵀn`` of a model with mimic joints, shape of ``q`` as in this model."""
+    """Return ``nᵀJM⁻²Jᵀn`` of a model with mimic joints; ``q`` has the shape of this model."""
     data = model.createData()
     M = pin.crba(model, data, q)
     M = np.triu(M) + np.triu(M, 1).T + np.diag(armature)

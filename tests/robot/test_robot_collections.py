@@ -1,4 +1,4 @@
-"""Robots of other packages' collections, by small packages that stand in for those that download."""
+"""Robots in collections of other packages; small packages replace the packages that download robots."""
 
 from __future__ import annotations
 

@@ -98,7 +98,7 @@ int main(int argc, char **argv)
     error_H = std::isnan(one) || status[row] != 0 ? INFINITY : std::fmax(error_H, one);
     error_grad = std::fmax(error_grad, difference / largest);
   }
-  // A call with one block: launched and waited for, and only launched.
+  // Time calls with one block: first until each call has finished, then until each call is launched.
   const auto began = std::chrono::steady_clock::now();
   for (int k = 0; k < 200; ++k) {
     launch(THREADS);

@@ -68,14 +68,14 @@ def times(cases: list[Case]) -> Iterator[list[str]]:
     """Yield a row for each case and each number of blocks per multiprocessor."""
     for case in cases:
         for blocks in case.get("blocks", [0]):
-            got = json.loads(run([f"./{program(case)}", case["samples"], str(case["rows"]), str(blocks)]))
-            if "error" in got:
-                yield [case["name"], case["real"], f"{case['threads']}", got["error"]]
+            data = json.loads(run([f"./{program(case)}", case["samples"], str(case["rows"]), str(blocks)]))
+            if "error" in data:
+                yield [case["name"], case["real"], f"{case['threads']}", data["error"]]
                 continue
             yield [
-                case["name"], case["real"], f"{case['threads']}", f"{got['threads']}", f"{got['million']:,.0f}",
-                f"{got['best']:,.0f}", f"{got['error_H']:.0e}", f"{got['error_grad']:.0e}", f"{got['registers']}",
-                f"{got['local']}", f"{got['call_us']:.1f}", f"{got['launch_us']:.1f}",
+                case["name"], case["real"], f"{case['threads']}", f"{data['threads']}", f"{data['million']:,.0f}",
+                f"{data['best']:,.0f}", f"{data['error_H']:.0e}", f"{data['error_grad']:.0e}", f"{data['registers']}",
+                f"{data['local']}", f"{data['call_us']:.1f}", f"{data['launch_us']:.1f}",
             ]  # fmt: skip
 
 
@@ -92,13 +92,13 @@ def cores(cases: list[Case]) -> Iterator[list[str]]:
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         errors = [*pool.map(build_cores, cases)]
     for case, error in zip(cases, errors, strict=True):
-        got = json.loads(error or run([f"./cores-{case['name']}", case["samples"]]))
+        data = json.loads(error or run([f"./cores-{case['name']}", case["samples"]]))
         yield [
             case["name"],
             *(
-                [got["error"]]
-                if "error" in got
-                else [str(got["cores"]), f"{got['million']:.1f}", f"{got['error_H']:.0e}"]
+                [data["error"]]
+                if "error" in data
+                else [str(data["cores"]), f"{data['million']:.1f}", f"{data['error_H']:.0e}"]
             ),
         ]
 
@@ -106,25 +106,25 @@ def cores(cases: list[Case]) -> Iterator[list[str]]:
 def frameworks(cases: list[Case]) -> Iterator[list[str]]:
     """Yield the times of calls from PyTorch."""
     for case in cases:
-        got = json.loads(run([sys.executable, "framework_peer.py", json.dumps(case)]))
-        if "error" in got:
-            yield [case["name"], case["real"], got["error"]]
+        data = json.loads(run([sys.executable, "framework_peer.py", json.dumps(case)]))
+        if "error" in data:
+            yield [case["name"], case["real"], data["error"]]
             continue
-        adam = f"{got['adam_s']:.2f} s, {got['before']:.3g} to {got['after']:.3g}" if "adam_s" in got else "–"
-        yield [case["name"], case["real"], f"{got['nvrtc_s']:.1f}", *[f"{us:.0f}" for us in got["us"]], adam]
+        adam = f"{data['adam_s']:.2f} s, {data['before']:.3g} to {data['after']:.3g}" if "adam_s" in data else "–"
+        yield [case["name"], case["real"], f"{data['nvrtc_s']:.1f}", *[f"{us:.0f}" for us in data["us"]], adam]
 
 
 def frax(cases: list[Case]) -> Iterator[list[str]]:
     """Yield the evaluations per second of frax."""
     for case in cases:
         for real in ("double", "float"):
-            got = json.loads(
+            data = json.loads(
                 run([sys.executable, "frax_peer.py", case["urdf"], case["root"], real, str(case["rows"] // 8)])
             )
             row = (
-                [got["error"]]
-                if "error" in got
-                else [f"{got['million']:.2f}", f"{got['compile_s']:.1f}", got["device"]]
+                [data["error"]]
+                if "error" in data
+                else [f"{data['million']:.2f}", f"{data['compile_s']:.1f}", data["device"]]
             )
             yield [case["name"], real, *row]
 
@@ -134,14 +134,14 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--build", default="", metavar="ARCHITECTURE")
     parser.add_argument("--only", default="", metavar="TEXT")
-    asked = parser.parse_args()
+    args = parser.parse_args()
     began = time.monotonic()
-    cases = [c for c in json.loads((HERE / "cases.json").read_text(encoding="utf-8")) if asked.only in c["name"]]
+    cases = [c for c in json.loads((HERE / "cases.json").read_text(encoding="utf-8")) if args.only in c["name"]]
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for case, error in zip(cases, pool.map(lambda c: build_gpu(c, asked.build or "native"), cases), strict=True):
+        for case, error in zip(cases, pool.map(lambda c: build_gpu(c, args.build or "native"), cases), strict=True):
             if error:
                 print(f"{program(case)}: {error}")
-    if asked.build:
+    if args.build:
         return 0
     name = run(["nvidia-smi", "--query-gpu=name,driver_version", "--format=csv,noheader"])
     print(f"{name}; {run(['nvcc', '--version'])}; {os.cpu_count()} cores; built in {time.monotonic() - began:.0f} s")

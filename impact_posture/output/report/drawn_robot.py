@@ -15,7 +15,7 @@ from pydantic import PlainSerializer, PlainValidator
 
 from impact_posture.collision.coal_geometry import geometry_key, load_geometry, read_shapes
 from impact_posture.collision.shape_corners import Triangles, hull_surface, shape_points, surface_of
-from impact_posture.collision.urdf_shapes import UrdfShape
+from impact_posture.collision.urdf_shapes import LinkShape
 from impact_posture.config.cached_values import StoredArray, cached
 from impact_posture.errors import PackageNotFound
 from impact_posture.output.plot.skeleton import link_tip
@@ -147,7 +147,7 @@ def draw_robot(robot: Robot, meshes: bool = False) -> DrawnRobot:
     return DrawnRobot(tuple(solids), tuple(parts), tuple(licenses.values()), tuple(notes))
 
 
-def _placed_solids(robot: Robot, described: list[UrdfShape], hulls: set[str]) -> PlacedSolids:
+def _placed_solids(robot: Robot, described: list[LinkShape], hulls: set[str]) -> PlacedSolids:
     """Return the meshes of the shapes; for names in ``hulls``, the convex hulls of the meshes."""
     loaded = load_geometry(robot, described)
     by_name = {shape.name: shape for shape in described}
@@ -220,7 +220,7 @@ def _sticks(robot: Robot) -> tuple[list[Solid], list[tuple[int, int, pin.SE3, Co
     return rods, [(parent, k, pin.SE3.Identity(), _GRAY) for k, (parent, _) in enumerate(spans)]
 
 
-def _color(shape: UrdfShape) -> Color:
+def _color(shape: LinkShape) -> Color:
     """Return the color in the URDF, or the mean color in a COLLADA file (coal does not read colors), or gray."""
     *color, opacity = shape.color or _GRAY
     if shape.color is None and shape.mesh is not None and shape.mesh.suffix.lower() == ".dae":

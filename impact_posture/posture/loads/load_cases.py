@@ -135,8 +135,8 @@ def _unlimited(robot: Robot) -> list[str]:
     slots = [slot for slot in Chart.of(robot.model).slots if unlimited[slot.v].any()]
     driven = [slot.name for slot in slots if slot.kind.family in ("revolute", "continuous", "prismatic")]
     passive = [slot.name for slot in slots if slot.name not in driven]
-    limit = "an effort limit (0, or not stated); state it in robot.toml [limits.effort]"
-    torque = f"at rest, the torque of {listed(driven)} is not checked without {limit}"
+    limit = "no effort limit above zero is stated; state it in robot.toml [limits.effort]"
+    torque = f"at rest, the torque of {listed(driven)} is not checked, because {limit}"
     balance = f"at rest, the balance of {listed(passive)} is not checked, because nothing drives it"
     return [torque] * bool(driven) + [balance] * bool(passive)
 
