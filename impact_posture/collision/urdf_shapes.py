@@ -134,11 +134,10 @@ class LinkShape:
 
     def _load_mesh(self, largest: float) -> Corrected:
         try:
-            scale = self.unit * np.array(self.sizes)
+            root, scale = _root_transform(self.mesh), self.unit * np.array(self.sizes)
             with quiet_stderr():
                 # Use a new loader every time, because a loader keeps all meshes in memory.
                 shape = coal.MeshLoader().load(str(self.mesh), scale)
-            root = _root_transform(self.mesh)
             if root is not None:
                 moved = (mesh_points(shape) / scale) @ root[:3, :3].T + root[:3, 3]
                 shape = triangle_mesh(moved * scale, mesh_triangles(shape))
@@ -199,6 +198,15 @@ def read_urdf_shapes(robot: Robot, first: str = "collision") -> LinkShapes:
     return read
 
 
+def _size(mesh: Path) -> int:
+    """Return the number of bytes in a mesh file, or in the files of a 3MF archive."""
+    with suppress(zipfile.BadZipFile):
+        if mesh.suffix.lower() == ".3mf":
+            with zipfile.ZipFile(mesh) as archive:
+                return sum(file.file_size for file in archive.infolist())
+    return mesh.stat().st_size
+
+
 def _head(mesh: Path) -> bytes:
     """Return the first bytes of a mesh file, or of the model inside a 3MF archive."""
     if mesh.suffix.lower() == ".3mf":
@@ -217,8 +225,10 @@ def _root_transform(mesh: Path | None) -> Array | None:
     if mesh is None or mesh.suffix.lower() not in (".gltf", ".glb"):
         return None
     data = mesh.read_bytes()
-    text = data[20 : 20 + int.from_bytes(data[12:16], "little")] if data.startswith(b"glTF") else data
-    content = json.loads(text)
+    end = 20 + int.from_bytes(data[12:16], "little") if data.startswith(b"glTF") else 0
+    if end > len(data):  # The mesh library would allocate the stated length.
+        raise ValueError("the file ends too early")
+    content = json.loads(data[20:end] if end else data)
     roots = [
         content["nodes"][k] for scene in content["scenes"][content.get("scene", 0) :][:1] for k in scene["nodes"]
     ]
@@ -294,7 +304,7 @@ def _find_mesh(text: str, urdf: Path, folders: Sequence[Path]) -> Path:
         if path.is_file():
             if not os.access(path, os.R_OK):
                 raise UnusableShape(f"{path} cannot be read; change its permissions")
-            if path.stat().st_size > _LARGEST_FILE:
+            if _size(path) > _LARGEST_FILE:
                 raise UnusableShape(f"{path} is larger than {_LARGEST_FILE // 1_000_000} MB; simplify the mesh")
             return path
     hint = "name the folder above the package with `package_dir`" if scheme == "package" else "correct the path"

@@ -102,9 +102,11 @@ def check_mass_matrix(robot: Robot, where: str) -> None:
     model = robot.model
     upper = np.triu(pin.crba(model, model.createData(), robot.posture()))
     moving = np.isfinite(model.armature)
-    M = (upper + np.triu(upper, 1).T)[np.ix_(moving, moving)]
+    M, C = (matrix[np.ix_(moving, moving)] for matrix in (upper + np.triu(upper, 1).T, robot.coupling_matrix))
     diagonal = np.diag(M)
-    if not np.abs(M).max() <= _LARGEST:
+    with np.errstate(over="ignore", invalid="ignore"):
+        largest = max(float(np.abs(matrix).max()) for matrix in (M, C.T @ M @ C))
+    if not largest <= _LARGEST:
         fault = f"the mass matrix has infinite or huge entries at posture '{robot.default_posture}'"
         hint = "correct the masses, inertias, lengths and `armature`; they are in kg, kg m² and m"
         raise InertiaError(fault, where=where, hint=hint)

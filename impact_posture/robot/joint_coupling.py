@@ -99,7 +99,7 @@ def _number(tag: ET.Element, key: str, default: float, where: str) -> float:
     except ValueError:
         value = np.nan
     if not np.isfinite(value):
-        fault = f"<mimic> of joint '{tag.get('joint')}': {key} '{tag.get(key)}' is not a number"
+        fault = f"<mimic joint='{tag.get('joint')}'>: {key} '{tag.get(key)}' is not a number"
         raise UrdfError(fault, where=where, hint="correct it")
     return value
 

@@ -25,6 +25,17 @@ _ROOT = re.compile(
     rb"(?:\xef\xbb\xbf)?\s*(?>(?><\?.*?\?>|<!--.*?-->|<!DOCTYPE[^>]*>)\s*)*+<mujoco(?:include)?\b", re.S
 )
 _HEAD = 50_000
+# Largest number of bodies, of repetitions, and of rows or columns of a height field.  MuJoCo takes 2 s to read 10,000
+# bodies, and four times as long for twice as many.  It crashes if a height field does not fit into memory.
+_MOST = 5_000
+_COUNT = re.compile(rb"""\b(?:nrow|ncol|count)\s*=\s*["']\s*(\d{1,9})""")
+# Fields of a compiled model that have to be finite, and fields of ranges, which may be infinite.
+_NUMBERS = (
+    "qpos0", "body_pos", "body_quat", "body_ipos", "body_iquat", "jnt_pos", "jnt_axis", "dof_armature", "site_pos",
+    "site_quat", "geom_pos", "geom_quat", "geom_size", "eq_data", "key_qpos", "actuator_gear", "actuator_armature",
+    "gravity",
+)  # fmt: skip
+_RANGES = ("jnt_range", "jnt_actfrcrange", "actuator_forcerange", "actuator_ctrlrange", "actuator_gainprm")
 
 
 class MjcfFile(NamedTuple):
@@ -62,9 +73,14 @@ def read_mjcf(path: Path, root: Root | None) -> MjcfFile:
         InputError: MuJoCo is not installed.
     """
     mujoco = import_mujoco()
+    text = path.read_bytes()
+    if max(text.count(b"<body"), *map(int, _COUNT.findall(text)), 0) > _MOST:
+        fault = f"has more than {_MOST} bodies, repetitions, or rows or columns of a height field"
+        raise MjcfError(fault, where=str(path), hint="name the file of the robot without its scene")
     with unwarned(), warnings.catch_warnings(action="ignore"):
         try:
             spec = mujoco.MjSpec.from_file(str(path))
+            spec.nkey = len(spec.keys)  # MuJoCo also allocates the stated number.
             if len(spec.bodies) < 2:  # The first body is the world.
                 hint = "name the file of a robot, or the file that includes this part"
                 raise MjcfError("has no body", where=str(path), hint=hint)
@@ -101,6 +117,9 @@ def _compile(spec: Any, path: Path) -> tuple[Any, list[str]]:
     for texture in spec.textures:
         texture.file, texture.cubefiles = "", [""] * 6
         texture.builtin, texture.width, texture.height = import_mujoco().mjtBuiltin.mjBUILTIN_FLAT, 1, 1
+    for asset in (*spec.meshes, *spec.hfields):
+        if asset.file and _asset(spec, asset).exists() and not _asset(spec, asset).is_file():
+            raise MjcfError(f"mesh '{asset.file}' is not a file", where=str(path), hint="correct its path")
     missing = {mesh.name: mesh.file for mesh in spec.meshes if mesh.file and not _asset(spec, mesh).is_file()}
     missing |= {field.name: field.file for field in spec.hfields if field.file and not _asset(spec, field).is_file()}
     try:
@@ -176,6 +195,11 @@ def _check_tree(model: Any, path: Path) -> None:
     if heavy.size:
         fault = f"body '{object_name(model, 'body', int(heavy[0]))}' has an infinite mass or inertia"
         raise MjcfError(fault, where=str(path), hint="correct the mass or the size of its geoms")
+    for key in (*_NUMBERS, *_RANGES):
+        values = model.opt.gravity if key == "gravity" else getattr(model, key)
+        if not (np.isfinite(values) if key in _NUMBERS else ~np.isnan(values)).all():
+            fault = f"its {key.replace('_', ' ')} is not finite"
+            raise MjcfError(fault, where=str(path), hint="correct the nan or inf in the file")
     free = np.flatnonzero(model.jnt_type == import_mujoco().mjtJoint.mjJNT_FREE)
     if free.size and (free.size > 1 or free[0]):
         fault = f"body '{object_name(model, 'body', int(model.jnt_bodyid[free[-1]]))}' floats beside other joints"

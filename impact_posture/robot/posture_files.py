@@ -149,6 +149,9 @@ def _in_order(robot: Robot, data: Mapping[str, object], where: str) -> Array:
             fault = f"leaves out joint '{missing[0]}'" if missing else "has the joints in another order"
             fault = f"{fault}, so that q cannot be read"
             raise PostureError(fault, where=where, hint='give them by name: "joints": {"name": value}')
+    if data.get("q_names", list(robot.q_names)) != list(robot.q_names):
+        fault = "has q_names of other entries, so that q cannot be read"
+        raise PostureError(fault, where=where, hint='give the joints by name: "joints": {"name": value}')
     q = _numbers(data["q"], "q", where)
     if not robot.floating and len(q) == robot.nq + 7:
         raise PostureError("begins with a base pose" + _FIXED, where=where, hint=_NO_BASE)

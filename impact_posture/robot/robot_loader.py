@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from fnmatch import fnmatchcase
@@ -70,6 +71,7 @@ def build_robot(located: Located, options: LoadOptions) -> Robot:
     _check_package_dirs(spec.model.package_dirs, base, f"{name} robot.toml [model] package_dirs")
     described = read_description(urdf, options.root or spec.model.root, accept_inertias=spec.model.accept_inertias)
     model, root, warnings = described.model, described.root, described.warnings
+    _check_names(model, source)
     _remount(model, options.mounting, name)
     srdf = srdf_path(spec, options, base)
     _override_limits(model, spec, name)
@@ -189,6 +191,9 @@ def locate(robot: str, options: LoadOptions) -> Located:
     folders = (*spec.model.package_dirs, *files.folders)
     spec = replace(spec, model=replace(spec.model, package_dirs=folders, srdf=spec.model.srdf or files.srdf))
     urdf = files.path
+    if os.path.exists(urdf) and not (os.path.isfile(urdf) or os.path.isdir(urdf)):
+        fault = "is a pipe or a device, which cannot be read more than once"
+        raise UrdfError(fault, where=str(urdf), hint="write its content into a file")
     if urdf.suffix == ".xacro":
         places = [Path(folder).expanduser() for folder in options.package_dir]
         places += [base / Path(folder).expanduser() for folder in folders]
@@ -249,6 +254,18 @@ def _override_limits(model: pin.Model, spec: RobotSpec, name: str) -> None:
             low[k], high[k] = -value, value
         setattr(model, f"lower{kind}Limit", low)
         setattr(model, f"upper{kind}Limit", high)
+
+
+def _check_names(model: pin.Model, source: str) -> None:
+    """Raise an error for a name of two joints or two links, because a name would select the wrong one."""
+    links = [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
+    for kind, names in (("joints", list(model.names)), ("links", links)):
+        name, count = Counter(names).most_common(1)[0] if names else ("", 0)
+        if count > 1:
+            hint = (
+                "rename one: 'universe' is the world, 'root_joint' the free-flyer; an MJCF numbers what has no name"
+            )
+            raise UrdfError(f"two {kind} have the name '{name}'", where=source, hint=hint)
 
 
 def _check_limits(model: pin.Model, source: str) -> None:

@@ -131,7 +131,7 @@ def _expanded(path: Path, values: _Arguments, packages: _Packages) -> ET.Element
             raise cause from None
         if isinstance(cause, OSError):
             raise UrdfError.unreadable(Path(cause.filename or path), cause) from None
-        fault = f"cannot be expanded ({error or type(error).__name__})"
+        fault = f"cannot be expanded ({str(error) or type(cause).__name__})"
         raise UrdfError(fault, where=str(path), hint="correct it, or give its arguments by `xacro_arg`") from None
 
 

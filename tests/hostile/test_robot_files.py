@@ -1,0 +1,116 @@
+"""Damaged MJCFs and couplings, archives that grow, and files that are not regular give a short error."""
+
+from __future__ import annotations
+
+import os
+import time
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from impact_posture.collision.urdf_shapes import UnusableShape, read_urdf_shapes
+from impact_posture.robot.robot_loader import load_robot
+from tests.hostile.arena import SMALL, strike
+
+PUSH = ("--frame", "tip", "--normal", "1", "0", "0.2")
+PATIENCE = 10  # s
+GEOM = '<geom type="capsule" size=".03" fromto="0 0 0 0 0 .3"/>'
+ARM = (
+    '<mujoco><worldbody><body name="upper"><joint name="shoulder" axis="0 1 0" range="-90 90"/>' + GEOM
+    + '<body name="lower" pos="0 0 .3"><joint name="elbow" axis="0 1 0"/>' + GEOM
+    + '<site name="tip" pos="0 0 .3"/></body></body></worldbody></mujoco>'
+)  # fmt: skip
+MIMIC = '<joint name="elbow" type="revolute"><mimic joint="shoulder" multiplier="1e200"/>'
+MESH = '<asset><mesh name="m" file="pipe.stl"/></asset></mujoco>'
+FIELD = '<asset><hfield name="h" nrow="100000" ncol="100000" size="1 1 1 1"/></asset></mujoco>'
+FAULTS = {
+    "name of the world": ("elbow", "universe", "two joints have the name 'universe'"),
+    "name of a joint without a name": ('name="shoulder"', 'name="joint1"', "two joints"),
+    "armature": ('name="elbow"', 'name="elbow" armature="nan"', "dof armature is not finite"),
+    "endless armature": ('name="elbow"', 'name="elbow" armature="inf"', "dof armature is not finite"),
+    "reference": ('name="elbow"', 'name="elbow" ref="inf"', "qpos0 is not finite"),
+    "limit": ("-90 90", "-90 nan", "jnt range is not finite"),
+    "bodies": ("</worldbody>", "<body/>" * 100_000 + "</worldbody>", "more than 5000 bodies"),
+    "repetitions": ("<site", '<replicate count="1000000"><geom size=".1"/></replicate><site', "repetitions"),
+    "mesh": ("</mujoco>", MESH, "'pipe.stl' is not a file"),
+    "height field": ("</mujoco>", FIELD, "rows or columns"),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_faults_of_an_mjcf(name: str, arena: Path) -> None:
+    old, new, words = FAULTS[name]
+    os.mkfifo(arena / "pipe.stl")
+    text = ARM.replace('name="elbow"', "", 1) if "joint1" in new else ARM
+    (arena / "bad.xml").write_text(text.replace(old, new, 1))
+    start = time.monotonic()
+    outcome = strike(arena, "evaluate", "bad.xml", *PUSH)
+    assert (outcome.code, outcome.complaints) == (1, []), outcome.err[-500:]
+    assert words in outcome.err and "bad.xml" in outcome.err
+    assert time.monotonic() - start < PATIENCE
+
+
+@pytest.mark.parametrize("infinity", ["range", "forcerange"])
+def test_ranges_may_be_infinite(infinity: str, arena: Path) -> None:
+    motor = '</worldbody><actuator><motor joint="elbow" forcerange="-inf inf"/></actuator>'
+    changes = {"range": ("-90 90", "-90 inf"), "forcerange": ("</worldbody>", motor)}
+    (arena / "arm.xml").write_text(ARM.replace(*changes[infinity]))
+    outcome = strike(arena, "inspect", "arm.xml")
+    assert (outcome.code, outcome.complaints) == (0, []), outcome.err
+
+
+@pytest.mark.parametrize("file", ["a.xml", "a.urdf", "a.xacro", "/dev/zero"])
+def test_pipes_and_devices(file: str, arena: Path) -> None:
+    if not Path(file).is_absolute():
+        os.mkfifo(arena / file)
+    outcome = strike(arena, "inspect", file)
+    assert (outcome.code, outcome.complaints) == (1, []), outcome.err
+    assert "is a pipe or a device" in outcome.err
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('<joint name="elbow" type="revolute">', MIMIC, "infinite or huge"),
+        ('"elbow"', '"universe"', "two joints have the name"),
+        ("</robot>", "<!--" * 200_000, "is not XML"),
+    ],
+)
+def test_faults_of_a_urdf(old: str, new: str, words: str, arena: Path) -> None:
+    (arena / "bad.urdf").write_text(SMALL.replace(old, new))
+    start = time.monotonic()
+    outcome = strike(arena, "evaluate", "bad.urdf", *PUSH)
+    assert (outcome.code, outcome.complaints) == (1, []), outcome.err[-500:]
+    assert words in outcome.err and "bad.urdf" in outcome.err
+    assert time.monotonic() - start < PATIENCE
+
+
+def test_entries_of_q_in_another_order(arena: Path) -> None:
+    (arena / "p.json").write_text('{"q": [0.1, 0.2], "q_names": ["elbow (rad)", "shoulder (rad)"]}')
+    outcome = strike(arena, "evaluate", "small.urdf", *PUSH, "--posture", "p.json")
+    assert (outcome.code, outcome.complaints) == (1, []), outcome.err
+    assert "q_names of other entries" in outcome.err
+
+
+def test_an_archive_that_grows(arena: Path) -> None:
+    """The archive has 0.1 MB, and its content has 110 MB."""
+    with zipfile.ZipFile(arena / "a.3mf", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        archive.writestr("3D/3dmodel.model", b" " * 110_000_000)
+    mesh = '</inertial><collision><geometry><mesh filename="a.3mf"/></geometry></collision>'
+    (arena / "mesh.urdf").write_text(SMALL.replace("</inertial>", mesh, 1))
+    (warning,) = read_urdf_shapes(load_robot(str(arena / "mesh.urdf"))).warnings
+    assert "a.3mf is larger than 100 MB" in warning
+
+
+def test_a_mesh_that_ends_too_early(arena: Path) -> None:
+    (arena / "a.glb").write_bytes(
+        b"glTF\2\0\0\0" + b"\xff" * 8 + b"JSON" + b'{"scenes": [{"nodes": [0]}], "nodes": [{}]}'
+    )
+    mesh = '</inertial><collision><geometry><mesh filename="a.glb"/></geometry></collision>'
+    (arena / "mesh.urdf").write_text(SMALL.replace("</inertial>", mesh, 1))
+    (shape,) = read_urdf_shapes(load_robot(str(arena / "mesh.urdf"))).shapes
+    start = time.monotonic()
+    with pytest.raises(UnusableShape, match="cannot be read as a mesh"):
+        shape.load(5.0)
+    assert time.monotonic() - start < 1
