@@ -150,7 +150,7 @@ def _in_order(robot: Robot, data: Mapping[str, object], where: str) -> Array:
             fault = f"{fault}, so that q cannot be read"
             raise PostureError(fault, where=where, hint='give them by name: "joints": {"name": value}')
     if data.get("q_names", list(robot.q_names)) != list(robot.q_names):
-        fault = "has q_names of other entries, so that q cannot be read"
+        fault = "has q_names that do not fit the robot, so q cannot be read"
         raise PostureError(fault, where=where, hint='give the joints by name: "joints": {"name": value}')
     q = _numbers(data["q"], "q", where)
     if not robot.floating and len(q) == robot.nq + 7:

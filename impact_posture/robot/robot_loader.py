@@ -257,14 +257,12 @@ def _override_limits(model: pin.Model, spec: RobotSpec, name: str) -> None:
 
 
 def _check_names(model: pin.Model, source: str) -> None:
-    """Raise an error for a name of two joints or two links, because a name would select the wrong one."""
+    """Raise an error if two joints or two links have the same name, which could select the wrong one."""
     links = [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
     for kind, names in (("joints", list(model.names)), ("links", links)):
         name, count = Counter(names).most_common(1)[0] if names else ("", 0)
         if count > 1:
-            hint = (
-                "rename one: 'universe' is the world, 'root_joint' the free-flyer; an MJCF numbers what has no name"
-            )
+            hint = "rename one. 'universe' is the world, 'root_joint' the free-flyer. Unnamed MJCF parts get numbers"
             raise UrdfError(f"two {kind} have the name '{name}'", where=source, hint=hint)
 
 

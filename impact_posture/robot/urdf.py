@@ -25,7 +25,8 @@ from impact_posture.robot.urdf_joints import clear_negative_limits, correct_join
 MOST_DEGREES_OF_FREEDOM = 200
 # Largest number of joints in a chain, including fixed joints.  Above 2,000, the URDF parser overflows the stack.
 _DEEPEST = 1_000
-# A comment.  It may contain "--", which XML forbids and urdfdom accepts, and ends at the latest with the file.
+# A comment.  It may contain "--", which XML forbids and urdfdom accepts.
+# Without an end, it reaches to the end of the file.
 _COMMENT = re.compile(r"<!--.*?(?:-->|\Z)", re.DOTALL)
 # An ampersand that begins no entity, which XML forbids and urdfdom accepts.
 _LONE_AMPERSAND = re.compile(r"&(?!(?:amp|lt|gt|quot|apos|#\d+|#x[\da-fA-F]+);)")

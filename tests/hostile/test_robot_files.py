@@ -90,7 +90,7 @@ def test_entries_of_q_in_another_order(arena: Path) -> None:
     (arena / "p.json").write_text('{"q": [0.1, 0.2], "q_names": ["elbow (rad)", "shoulder (rad)"]}')
     outcome = strike(arena, "evaluate", "small.urdf", *PUSH, "--posture", "p.json")
     assert (outcome.code, outcome.complaints) == (1, []), outcome.err
-    assert "q_names of other entries" in outcome.err
+    assert "q_names that do not fit the robot" in outcome.err
 
 
 def test_an_archive_that_grows(arena: Path) -> None:
