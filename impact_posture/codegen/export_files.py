@@ -21,7 +21,7 @@ from impact_posture.codegen.export_library import NamedObjective
 from impact_posture.codegen.manifest_reader import identity
 from impact_posture.codegen.self_test import self_test_tolerance
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
-from impact_posture.robot.robot import unit_parts
+from impact_posture.robot.robot import Robot, unit_parts
 from impact_posture.system.escape import c_comment, markdown
 from impact_posture.version import __version__
 
@@ -90,6 +90,20 @@ def _verbatim(function: Callable[..., str]) -> Callable[..., Verbatim]:
     return lambda *arguments: Verbatim(function(*arguments))
 
 
+def _couplings(robot: Robot) -> list[dict[str, list[str] | str]]:
+    """Return for each leader the equations of its followers in ``q``, and the derivative along the joint motion."""
+    q, v, groups = robot.model.idx_qs, robot.model.idx_vs, list[dict[str, list[str] | str]]()
+    for leader in dict.fromkeys(c.leader for c in robot.couplings):
+        lead, followers = robot.joint_id(leader), [c for c in robot.couplings if c.leader == leader]
+        joints = [(c, robot.joint_id(c.follower)) for c in followers]
+        group: dict[str, list[str] | str] = {
+            "equations": [f"q[{q[k]}] = {c.ratio!r} q[{q[lead]}] + {c.offset!r}" for c, k in joints],
+            "derivative": " + ".join([f"grad[{v[lead]}]", *(f"{c.ratio!r} grad[{v[k]}]" for c, k in joints)]),
+        }
+        groups.append(group)
+    return groups
+
+
 def wrapped(words: Iterable[str], indent: str) -> str:
     """Join words by commas, with line breaks so that the text fits into a comment."""
     lines, line = [], ""
@@ -149,6 +163,7 @@ def _context(
             if supports
             else "none (the free robot)"
         ),
+        "couplings": _couplings(objective.robot),
         "unit_rule": (
             f"a quaternion or a cosine-sine pair in q is not of unit norm (to {real.unit_tolerance:g})"
             if units

@@ -50,6 +50,7 @@ def parse_armature(texts: Sequence[str]) -> Mapping[str, float] | str | None:
             raise InputError(
                 f"'{text}' is not JOINT=VALUE", where="armature", hint="give none, one file, or only JOINT=VALUE"
             ) from None
+    _check_once([text.rpartition("=")[0] for text in texts], "armature")
     return values
 
 
@@ -61,7 +62,14 @@ def parse_xacro_arguments(texts: Sequence[str]) -> Mapping[str, str]:
         if not (name and sign):
             raise InputError(f"'{text}' is not NAME:=VALUE", where="xacro_arg", hint="for example hand:=true")
         values[name] = value
+    _check_once([text.partition(":=")[0] for text in texts], "xacro_arg")
     return values
+
+
+def _check_once(names: Sequence[str], where: str) -> None:
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"'{name}' has two values", where=where, hint="remove one")
 
 
 def parse_payloads(texts: Sequence[str]) -> tuple[tuple[str, float], ...]:

@@ -114,3 +114,10 @@ def test_a_mesh_that_ends_too_early(arena: Path) -> None:
     with pytest.raises(UnusableShape, match="cannot be read as a mesh"):
         shape.load(5.0)
     assert time.monotonic() - start < 1
+
+
+@pytest.mark.parametrize("option", [("--armature", "shoulder=1"), ("--xacro-arg", "hand:=true")])
+def test_two_values_of_one_name(option: tuple[str, str], arena: Path) -> None:
+    outcome = strike(arena, "evaluate", "small.urdf", *PUSH, *option, option[0], option[1].replace("=", "=2"))
+    assert (outcome.code, outcome.complaints) == (2, []), outcome.err
+    assert "has two values" in outcome.err and option[0] in outcome.err

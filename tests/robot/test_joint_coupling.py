@@ -120,6 +120,16 @@ def test_gradients_and_the_exported_code_agree(tmp_path: Path, kind: str, metric
         code, (H, slope) = compiled.call("eval", q, np.array(contact.normal))
         assert code == 0 and float(np.ravel(H)[0]) == pytest.approx(objective.value(q), rel=1e-12)
         assert_close(np.ravel(slope), objective.gradient(q), 1e-10, "C")
+        header = (tmp_path / "code" / "grip.h").read_text()
+        equations = [
+            line.removeprefix(" *   ") for line in header.splitlines() if " = " in line and "q[2] + " in line
+        ]
+        for equation, entry in zip(equations, (3, 4), strict=True):
+            left, right = equation.replace(" q[2]", " * q[2]").split(" = ")
+            assert left == f"q[{entry}]" and eval(right, {"q": q}) == pytest.approx(q[entry])
+        (sum_,) = (line.removeprefix(" *   ") for line in header.splitlines() if "grad[2] + " in line)
+        along = eval(sum_.replace(" grad", " * grad").replace("+ * ", "+ "), {"grad": np.ravel(slope)})
+        assert along == pytest.approx(together[2])
 
 
 @pytest.mark.parametrize("kind", ["prismatic", "revolute"])
