@@ -33,7 +33,8 @@ _COUNT = re.compile(rb"""\b(?:nrow|ncol|count)\s*=\s*["']\s*(\d{1,9})""")
 _NUMBERS = (
     "qpos0", "body_pos", "body_quat", "body_ipos", "body_iquat", "jnt_pos", "jnt_axis", "dof_armature", "site_pos",
     "site_quat", "geom_pos", "geom_quat", "geom_size", "eq_data", "key_qpos", "actuator_gear", "actuator_armature",
-    "gravity",
+    "gravity", "qpos_spring", "jnt_stiffness", "dof_damping", "dof_frictionloss", "geom_friction", "geom_solref",
+    "geom_solimp", "geom_solmix", "geom_margin", "geom_gap",
 )  # fmt: skip
 _RANGES = ("jnt_range", "jnt_actfrcrange", "actuator_forcerange", "actuator_ctrlrange", "actuator_gainprm")
 

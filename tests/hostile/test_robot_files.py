@@ -31,6 +31,8 @@ FAULTS = {
     "endless armature": ('name="elbow"', 'name="elbow" armature="inf"', "dof armature is not finite"),
     "reference": ('name="elbow"', 'name="elbow" ref="inf"', "qpos0 is not finite"),
     "limit": ("-90 90", "-90 nan", "jnt range is not finite"),
+    "damping": ('name="elbow"', 'name="elbow" damping="nan"', "dof damping is not finite"),
+    "friction": ("<geom", '<geom friction="nan .1 .1"', "geom friction is not finite"),
     "bodies": ("</worldbody>", "<body/>" * 100_000 + "</worldbody>", "more than 5000 bodies"),
     "repetitions": ("<site", '<replicate count="1000000"><geom size=".1"/></replicate><site', "repetitions"),
     "mesh": ("</mujoco>", MESH, "'pipe.stl' is not a file"),
