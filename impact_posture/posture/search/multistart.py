@@ -31,6 +31,8 @@ from impact_posture.system.arrays import Array
 # Two final postures are the same optimum if their tangent distance and the relative difference of their objectives
 # are below these values.
 SAME_POSTURE, _SAME_OBJECTIVE = 1e-2, 1e-4
+# Objectives, divided by the initial objective, are equal if these decimals are equal.
+_DIGITS = 9
 # If the relative reduction of the objective is below this value, the result is not reported as better.  The jump is
 # the square root of the objective, so the jump then changes by less than 0.05 %.
 _NO_GAIN = 1e-3
@@ -146,7 +148,7 @@ def solve(
         hint = "try more `starts`, another `posture`, or a larger `clearance`"
         raise SolverFailed(fault, where="solver", hint=hint)
     # Among equally good runs, take the first in the order of starts, so that the solution does not depend on timing.
-    best = min(good, key=lambda r: round(r.minimized, 9))
+    best = min(good, key=lambda r: round(r.minimized, _DIGITS))
     assert best.record is not None and best.certificate is not None  # noqa: S101 (narrows types)
     q, certificate, notes = best.record.q, best.certificate, []
     numeric = Numeric(problem.robot.model)
@@ -160,9 +162,8 @@ def solve(
         other = np.linalg.norm(wrapped_difference(problem, initial, q)) > SAME_POSTURE
         notes.append(f"{note}; the posture shown is another posture with equal objective" if other else note)
     hits_of = {id(run): count for run, count in zip(runs, hits, strict=True)}
-    optima = distinct(
-        problem, [(r.record.q, r.objective) for r in good if r.record], [hits_of[id(r)] for r in good if r.record]
-    )
+    ends = [(r.record.q, r.objective) for r in good if r.record]
+    optima = distinct(problem, ends, [hits_of[id(r)] for r in good if r.record], scale)
     notes += notes_on_impacts(problem.objective, initial, q)
     if touching:
         count = len(certified) - len(good)
@@ -228,15 +229,19 @@ def _without_collisions(problem: ConstrainedProblem, runs: list[SolverRun]) -> t
 
 
 def distinct(
-    problem: ConstrainedProblem, ends: list[tuple[Array, float]], hits: Sequence[int] | None = None
+    problem: ConstrainedProblem,
+    ends: list[tuple[Array, float]],
+    hits: Sequence[int] | None = None,
+    scale: float | None = None,
 ) -> tuple[Optimum, ...]:
     """Group final postures, given with their objectives, by optimum; the best objective comes first.
 
-    ``hits`` is the number of starts that each posture stands for, by default one.
+    ``hits`` is the number of starts that each posture stands for, by default one.  Objectives that differ by less
+    than 1e-9 of ``scale`` count as equal, and keep the order of ``ends``.
     """
     optima: list[Optimum] = []
     weighted = [(*end, count) for end, count in zip(ends, hits or [1] * len(ends), strict=True)]
-    for q, objective, count in sorted(weighted, key=lambda end: end[1]):
+    for q, objective, count in sorted(weighted, key=lambda end: round(end[1] / scale, _DIGITS) if scale else end[1]):
         for k, known in enumerate(optima):
             near = abs(objective - known.objective) <= _SAME_OBJECTIVE * max(abs(known.objective), 1e-300)
             if near and np.linalg.norm(wrapped_difference(problem, known.q, q)) < SAME_POSTURE:
