@@ -67,7 +67,7 @@ STUDIES = {
         ),
         Study("formulations", "formulations", "the linear solve inside the program or its objective", 12, page=False),
         Study("kernel", "kernel.times", "H and ∇H beside Pinocchio C++, ADAM and CasADi; passes", 101),
-        Study("gpu", "gpu.study", "H and ∇H on a GPU beside all cores, PyTorch and frax", page=False),
+        Study("gpu", "gpu.study", "H and ∇H on a GPU beside all cores, PyTorch and frax"),
         Study("loader", "exported:loader", "a call of exported code from Python; passes", 100, page=False),
         Study("tsid", "tsid", "a tick of the online controllers; ticks", 2000),
         Study("relaxed", "relaxed", "relaxed ticks in C of pushed robots; budget of iterations", 100, page=False),
