@@ -17,7 +17,7 @@ from impact_posture.collision.mesh_check import mesh_collisions
 from impact_posture.collision.robot_shapes import RobotShapes, load_shapes
 from impact_posture.collision.shape_pairs import random_postures
 from impact_posture.dynamics.numeric import Numeric
-from impact_posture.posture.constraints.nested_links import NestedLinks
+from impact_posture.posture.constraints.linear_joints import LinearJoints
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.system.arrays import Array
@@ -198,7 +198,7 @@ def test_shapes_that_touch_nowhere_need_no_plane() -> None:
 def test_within_the_planes_the_waist_of_g1_does_not_touch(seed: int) -> None:
     robot = load_robot("g1")
     (planes,) = (one for one in load_shapes(robot).joint_planes if one.joints == WAIST)
-    constraint, numeric = NestedLinks(robot, planes), Numeric(robot.model)
+    constraint, numeric = LinearJoints.apart(robot, planes), Numeric(robot.model)
     assert set(planes.bodies) == {"waist_yaw_link", "torso_link"}
     q = robot.posture()
     at = [robot.model.idx_qs[robot.joint_id(name)] for name in WAIST]

@@ -19,7 +19,7 @@ from impact_posture.dynamics.tree import PointOnLink
 from impact_posture.errors import InputError, listed
 from impact_posture.impact.impact_contact import ImpactContact, point_on
 from impact_posture.posture.constraints.clearance import Clearance
-from impact_posture.posture.constraints.nested_links import NestedLinks
+from impact_posture.posture.constraints.linear_joints import LinearJoints
 from impact_posture.posture.constraints.pair_distances import PairDistances
 from impact_posture.posture.constraints.separating_plane import ConvexBody, SeparatingPlane
 from impact_posture.robot.model_joints import rigid_groups
@@ -151,10 +151,10 @@ class Surroundings:
         return self._depths.get(contact, 0.0)
 
     @cached_property
-    def nested(self) -> list[NestedLinks]:
-        """Constraints on pairs of links whose convex hulls overlap (:class:`NestedLinks`)."""
+    def nested(self) -> list[LinearJoints]:
+        """Constraints on pairs of links whose convex hulls overlap (:class:`JointPlanes`)."""
         planes = [planes for planes in self.shapes.joint_planes if len(planes.bounds)]
-        return [NestedLinks(self.robot, some) for some in planes if not {*some.joints} <= self._held]
+        return [LinearJoints.apart(self.robot, some) for some in planes if not {*some.joints} <= self._held]
 
     @cached_property
     def constraints(self) -> list[Clearance]:

@@ -20,7 +20,7 @@ from impact_posture.posture.approach.approach_speed import ApproachSpeed
 from impact_posture.posture.approach.attainable_speed import AttainableSpeed
 from impact_posture.posture.constraints.center_of_mass_over_feet import CenterOfMassOverFeet
 from impact_posture.posture.constraints.constraint import Constraint
-from impact_posture.posture.constraints.coupled_joint import CoupledJoint
+from impact_posture.posture.constraints.linear_joints import LinearJoints
 from impact_posture.posture.constraints.pose_constraints import (
     AxisInCone,
     HeldOrientation,
@@ -99,7 +99,7 @@ def build_problem(robot: Robot, objective: Objective, given: Array, requirements
         constraints += [*around.nested, *around.constraints]
         notes += around.notes
     constraints += [constraint for case in loads.cases for constraint in case.constraints()]
-    constraints += [CoupledJoint(robot, c) for c in robot.couplings if c.follower not in requirements.hold]
+    constraints += [LinearJoints.coupled(robot, c) for c in robot.couplings if c.follower not in requirements.hold]
     problem = ConstrainedProblem(
         robot, objective, requirements, given, tuple(constraints), lower, upper, (), tuple(notes), around
     )
