@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import sys
 from collections import Counter
 from importlib import import_module
@@ -25,7 +26,7 @@ from docs.studies.kernel.times import PEERS, ROBOTS, Report, lines, measure
 from docs.studies.solve import TARGETS_MS
 from docs.studies.tsid import GOALS
 from impact_posture.codegen.export import export
-from impact_posture.errors import CompilerError
+from impact_posture.errors import CompilerError, InputError
 from impact_posture.robot.robot_loader import known_robots, load_robot
 from tests.support.helpers import robot
 from tests.support.tools import need_compiler
@@ -129,6 +130,12 @@ def test_joints_that_peers_lack_are_refused(folder: Path) -> None:
     parents, kinds, *_ = pinocchio.model_arrays(robot("solo8").model)
     assert list(kinds[:3]) == [8, 1, 1] and list(parents[:3]) == [0, 1, 2]
     assert Samples(robot("solo8"), "base_link").plain
+
+
+def test_the_page_of_a_gpu_is_not_written_without_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shutil, "which", lambda tool: None)
+    with pytest.raises(InputError, match=r"no nvidia-smi, nvcc, gcc; .* copy .* to a machine with a GPU"):
+        next(STUDIES["gpu"].lines(Request(write=True)))
 
 
 def test_compiled_code_is_cached(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -26,13 +26,13 @@ template <typename T> static T *on_device(const std::vector<T> &values)
   return data;
 }
 
-// Arguments: file of samples, number of rows, and number of blocks per multiprocessor; 0 for one thread for each row.
+// Arguments: file of samples, and number of rows.
 int main(int argc, char **argv)
 {
-  if (argc != 4) {
+  if (argc != 3) {
     return 2;
   }
-  const int count = std::atoi(argv[2]), limit = std::atoi(argv[3]);
+  const int count = std::atoi(argv[2]);
   int sizes[3];
   std::FILE *file = std::fopen(argv[1], "rb");
   if (file == nullptr || std::fread(sizes, sizeof(int), 3, file) != 3) {
@@ -55,14 +55,10 @@ int main(int argc, char **argv)
   const auto kernel = KERNEL<THREADS>;
   cudaFuncAttributes attributes;
   check(cudaFuncGetAttributes(&attributes, kernel));
-  int resident = 0, processors = 0;
+  int resident = 0;
   check(cudaOccupancyMaxActiveBlocksPerMultiprocessor(&resident, kernel, THREADS, 0));
-  check(cudaDeviceGetAttribute(&processors, cudaDevAttrMultiProcessorCount, 0));
-  resident = limit > 0 ? std::min(limit, resident) : resident;
   const auto launch = [&](int rows) {
-    const int blocks = (rows + THREADS - 1) / THREADS;
-    kernel<<<limit > 0 ? std::min(blocks, limit * processors) : blocks, THREADS>>>(
-      dq, dn, count, rows, dH, dgrad, dstatus);
+    kernel<<<(rows + THREADS - 1) / THREADS, THREADS>>>(dq, dn, count, rows, dH, dgrad, dstatus);
   };
   cudaEvent_t start, stop;
   check(cudaEventCreate(&start));
@@ -111,9 +107,9 @@ int main(int argc, char **argv)
   const auto end = std::chrono::steady_clock::now();
   check(cudaDeviceSynchronize());
   const double median = times[times.size() / 2], least = times[0];
-  std::printf("{\"rows\": %d, \"ms\": %.4f, \"million\": %.1f, \"best\": %.1f, \"error_H\": %.1e, \"error_grad\": %.1e, "
+  std::printf("{\"million\": %.1f, \"best\": %.1f, \"error_H\": %.1e, \"error_grad\": %.1e, "
     "\"registers\": %d, \"local\": %zu, \"threads\": %d, \"call_us\": %.1f, \"launch_us\": %.1f}\n",
-    count, median, count / median / 1e3, count / least / 1e3, error_H, error_grad, attributes.numRegs,
+    count / median / 1e3, count / least / 1e3, error_H, error_grad, attributes.numRegs,
     attributes.localSizeBytes, resident * THREADS,
     std::chrono::duration<double, std::micro>(middle - began).count() / 200,
     std::chrono::duration<double, std::micro>(end - middle).count() / 200);

@@ -39,7 +39,7 @@ def run(line: list[str], seconds: int = 120) -> str:
 
 def program(case: Case) -> str:
     """Return the name of the program that times a case."""
-    return f"{case['name']}-{case['real']}-{case['threads']}".replace(" ", "_")
+    return f"{case['name']}-{case['real']}-{case['threads']}"
 
 
 def build_gpu(case: Case, architecture: str) -> str:
@@ -51,7 +51,7 @@ def build_gpu(case: Case, architecture: str) -> str:
         "THREADS": case["threads"],
     }  # fmt: skip
     line = ["nvcc", "-std=c++17", "-O3", f"-arch={architecture}", *[f"-D{k}={v}" for k, v in defined.items()]]
-    answer = run([*line, *case.get("flags", []), "bench.cu", "-o", program(case)], 300)
+    answer = run([*line, "bench.cu", "-o", program(case)], 300)
     return answer if answer.startswith("{") else ""
 
 
@@ -65,18 +65,17 @@ def build_cores(case: Case) -> str:
 
 
 def times(cases: list[Case]) -> Iterator[list[str]]:
-    """Yield a row for each case and each number of blocks per multiprocessor."""
+    """Yield a row for each case."""
     for case in cases:
-        for blocks in case.get("blocks", [0]):
-            data = json.loads(run([f"./{program(case)}", case["samples"], str(case["rows"]), str(blocks)]))
-            if "error" in data:
-                yield [case["name"], case["real"], f"{case['threads']}", data["error"]]
-                continue
-            yield [
-                case["name"], case["real"], f"{case['threads']}", f"{data['threads']}", f"{data['million']:,.0f}",
-                f"{data['best']:,.0f}", f"{data['error_H']:.0e}", f"{data['error_grad']:.0e}", f"{data['registers']}",
-                f"{data['local']}", f"{data['call_us']:.1f}", f"{data['launch_us']:.1f}",
-            ]  # fmt: skip
+        data = json.loads(run([f"./{program(case)}", case["samples"], str(case["rows"])]))
+        if "error" in data:
+            yield [case["name"], case["real"], f"{case['threads']}", data["error"]]
+            continue
+        yield [
+            case["name"], case["real"], f"{case['threads']}", f"{data['threads']}", f"{data['million']:,.0f}",
+            f"{data['best']:,.0f}", f"{data['error_H']:.0e}", f"{data['error_grad']:.0e}", f"{data['registers']}",
+            f"{data['local']}", f"{data['call_us']:.1f}", f"{data['launch_us']:.1f}",
+        ]  # fmt: skip
 
 
 def table(head: str, rows: Iterator[list[str]]) -> None:
@@ -93,14 +92,12 @@ def cores(cases: list[Case]) -> Iterator[list[str]]:
         errors = [*pool.map(build_cores, cases)]
     for case, error in zip(cases, errors, strict=True):
         data = json.loads(error or run([f"./cores-{case['name']}", case["samples"]]))
-        yield [
-            case["name"],
-            *(
-                [data["error"]]
-                if "error" in data
-                else [str(data["cores"]), f"{data['million']:.1f}", f"{data['error_H']:.0e}"]
-            ),
-        ]
+        numbers = (
+            [data["error"]]
+            if "error" in data
+            else [str(data["cores"]), f"{data['million']:.1f}", f"{data['error_H']:.0e}"]
+        )
+        yield [case["name"], *numbers]
 
 
 def frameworks(cases: list[Case]) -> Iterator[list[str]]:
@@ -144,14 +141,16 @@ def main() -> int:
     if args.build:
         return 0
     name = run(["nvidia-smi", "--query-gpu=name,driver_version", "--format=csv,noheader"])
+    if name.startswith("{"):
+        print(name)
+        return 1
     print(f"{name}; {run(['nvcc', '--version'])}; {os.cpu_count()} cores; built in {time.monotonic() - began:.0f} s")
     head = "robot|type|threads|resident|million/s|best|error H|error ∇H|registers|local B|call µs|launch µs"
     table(head, times(cases))
-    main_cases = [c for c in cases if not c.get("variant")]
-    double = [c for c in main_cases if c["real"] == "double"]
+    double = [c for c in cases if c["real"] == "double"]
     table("robot|cores|million/s|error H", cores(double))
-    table("robot|type|NVRTC s|1 row µs|4,096 rows|65,536 rows|300 Adam steps of 65,536", frameworks(main_cases))
-    table("frax|type|million/s|compile s|device", frax([c for c in double if c.get("frax")]))
+    table("robot|type|NVRTC s|1 row µs|4,096 rows|65,536 rows|300 Adam steps of 65,536", frameworks(cases))
+    table("frax|type|million/s|compile s|device", frax([c for c in double if c["frax"]]))
     print(f"\n{time.monotonic() - began:.0f} s")
     return 0
 
