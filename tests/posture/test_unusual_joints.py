@@ -1,4 +1,4 @@
-"""Robots with passive, free, held and sliding joints: what is checked, what is noted, and what is no constraint."""
+"""Robots with passive, free, held and sliding joints: checks, notes, and pairs of links that need no distance."""
 
 from __future__ import annotations
 
