@@ -7,7 +7,7 @@ from itertools import product
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from impact_posture.dynamics.numeric import Numeric
@@ -96,6 +96,9 @@ def active_set(A: Vector, start: Vector) -> Vector:
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from(STANDING))
+@example(42, "solo12")
+@example(19, "go2")
+@example(19, "g1")
 def test_feet_lift_only_without_load(seed: int, name: str) -> None:
     generator = np.random.default_rng(seed)
     objective, q = hit(name, unit(generator), float(generator.uniform(0.1, 1.2)))
@@ -112,6 +115,9 @@ def test_feet_lift_only_without_load(seed: int, name: str) -> None:
     assert velocities[:, 2].min() > -1e-6
     moving = {f for f, v in zip(feet.frames, velocities, strict=True) if np.linalg.norm(v) > 0.02}
     assert moving <= {*impact.lifts, *impact.slides}
+    # A foot that slides stays on the ground.
+    sliding = np.isin(feet.frames, impact.slides) & (np.linalg.norm(velocities, axis=1) > 0.01)
+    assert velocities[sliding, 2].max(initial=0.0) <= 1e-3
     staying = {f for f, v in zip(feet.frames, velocities, strict=True) if np.linalg.norm(v) < 5e-3}
     assert not staying & set(impact.lifts) or any(s.has_sole for s in objective.supports)
 

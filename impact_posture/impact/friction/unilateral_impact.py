@@ -28,7 +28,8 @@ from impact_posture.impact.quantities.impact_oracle import ImpactOracle
 from impact_posture.robot.robot_spec import Support
 from impact_posture.system.arrays import Array
 
-# A foot moves if its speed is above this share of the approach speed.
+# A foot moves if its speed is above this share of the approach speed.  It also lifts if a point that moves leaves the
+# ground with a tenth of this speed; a point that slides stays on the ground.
 _MOVES = 0.01
 # Number of steps of an impact in which the weight is counted.
 _STEPS = 8
@@ -135,8 +136,7 @@ def unilateral_impact(
         fastest = np.maximum(fastest, np.linalg.norm(velocities, axis=1))
         up = np.maximum(up, velocities[:, 2])
     moves = fastest > _MOVES * speed
-    # A point that moves lifts, slides, or both; at least one of these velocities is above 1/√2 of the limit.
-    lifting = moves & (up > _MOVES * speed / np.sqrt(2))
+    lifting = moves & (up > _MOVES / 10 * speed)
     lifts, moving = (dict.fromkeys(np.array(feet.frames)[points].tolist()) for points in (lifting, moves))
     return UnilateralImpact(jump, impulses, tuple(lifts), tuple(frame for frame in moving if frame not in lifts))
 
