@@ -15,7 +15,6 @@ from impact_posture.collision.swept_hull import SweptHull, separation, transform
 from impact_posture.errors import UrdfError
 from impact_posture.robot.model_joints import v_slice
 from impact_posture.robot.robot import Robot
-from impact_posture.robot.robot_loader import locate, srdf_path
 from impact_posture.system.arrays import Array
 
 # Number of random postures in touching_by_design, and in nested_pairs.
@@ -134,11 +133,8 @@ def random_postures(robot: Robot, count: int) -> Iterator[Array]:
 
 def disabled_links(robot: Robot) -> set[frozenset[str]]:
     """Return the pairs of links that the SRDF or the MJCF allows to touch."""
-    if robot.settings is None:
-        return set()
     pairs = set() if robot.mjcf is None else disabled_bodies(robot.mjcf.model)
-    located = locate(robot.settings.robot, robot.settings)
-    path = srdf_path(located.spec, robot.settings, located.folder)
+    path = None if robot.files is None else robot.files.srdf
     if path is None:
         return pairs
     try:

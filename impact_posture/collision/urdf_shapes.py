@@ -8,7 +8,7 @@ import os
 import re
 import xml.etree.ElementTree as ET
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -22,8 +22,7 @@ import pinocchio as pin
 
 from impact_posture.collision.shape_corners import Corrected, correct, mesh_points, mesh_triangles, triangle_mesh
 from impact_posture.errors import UrdfError, one_line
-from impact_posture.robot.robot import Robot
-from impact_posture.robot.robot_loader import locate
+from impact_posture.robot.robot import Robot, RobotFiles
 from impact_posture.robot.urdf import parse_urdf, quiet_stderr
 from impact_posture.system.arrays import Array
 
@@ -173,26 +172,22 @@ def read_urdf_shapes(robot: Robot, first: str = "collision") -> LinkShapes:
     Raises:
         UrdfError: The URDF has become unreadable, or its links differ from the links of the robot.
     """
-    if robot.settings is None:
-        return LinkShapes([], [], [])
-    located = locate(robot.settings.robot, robot.settings)
-    folders = [Path(folder).expanduser() for folder in robot.settings.package_dir]
-    folders += [located.folder / Path(folder).expanduser() for folder in located.spec.model.package_dirs]
-    folders += [Path(folder) for folder in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if folder]
-    read = LinkShapes([], [], [])
-    root = parse_urdf(located.urdf)
+    read, files = LinkShapes([], [], []), robot.files
+    if files is None:
+        return read
+    root = parse_urdf(files.urdf)
     colors = {tag.get("name", ""): tag for tag in root.findall("material")}
     for link in root.iter("link"):
         name = link.get("name", "")
         if not robot.model.existFrame(name, pin.FrameType.BODY):
-            raise UrdfError("has changed since the robot was loaded", where=str(located.urdf), hint="load it again")
+            raise UrdfError("has changed since the robot was loaded", where=str(files.urdf), hint="load it again")
         tags = link.findall(first) or link.findall("visual") or link.findall("collision")
         if tags:
             read.described.append(name)
         for k, tag in enumerate(tags):
             unique = name if len(tags) == 1 else f"{name}[{k}]"
             try:
-                read.shapes.append(_read(tag, unique, name, located.urdf, folders, colors))
+                read.shapes.append(_read(tag, unique, name, files, colors))
             except UnusableShape as fault:
                 read.warnings.append(left_out(unique, fault))
     return read
@@ -249,9 +244,7 @@ def left_out(name: str, fault: UnusableShape) -> str:
     return one_line(f"shape {name} is left out: {fault}")
 
 
-def _read(
-    tag: ET.Element, name: str, link: str, urdf: Path, folders: Sequence[Path], colors: Mapping[str, ET.Element]
-) -> LinkShape:
+def _read(tag: ET.Element, name: str, link: str, files: RobotFiles, colors: Mapping[str, ET.Element]) -> LinkShape:
     shape = next(iter(tag.findall("geometry/*")), None)
     if shape is None or shape.tag not in _SIZES:
         known = ", ".join(_SIZES)
@@ -268,7 +261,7 @@ def _read(
         for key in ("xyz", "rpy")
     )
     placement = pin.SE3(pin.rpy.rpyToMatrix(np.array(rpy)), np.array(xyz))
-    mesh = _find_mesh(shape.get("filename", ""), urdf, folders) if shape.tag == "mesh" else None
+    mesh = _find_mesh(shape.get("filename", ""), files) if shape.tag == "mesh" else None
     material = tag.find("material")
     return LinkShape(name, link, placement, shape.tag, tuple(sizes), mesh, _color(material, colors))
 
@@ -293,13 +286,14 @@ def _numbers(text: str, count: int, where: str) -> list[float]:
     return numbers
 
 
-def _find_mesh(text: str, urdf: Path, folders: Sequence[Path]) -> Path:
+def _find_mesh(text: str, files: RobotFiles) -> Path:
     """Return the file of a mesh; ``package://`` paths start from a package folder or a folder above the URDF."""
     scheme, colon, rest = text.partition("://")
     if scheme == "file":
         paths = [Path(unquote(rest))]
     else:
-        paths = [folder / rest for folder in (*folders, *urdf.absolute().parents)] if colon else [urdf.parent / text]
+        above = (*files.folders, *files.urdf.absolute().parents)
+        paths = [folder / rest for folder in above] if colon else [files.urdf.parent / text]
     for path in paths:
         if path.is_file():
             if not os.access(path, os.R_OK):

@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.collision.foot_shape import support
-from impact_posture.config.problem_settings import LoadOptions, RobotSettings, Root
+from impact_posture.config.problem_settings import LoadOptions, Root
 from impact_posture.draft.toml_lines import Draft, comment_lines
 from impact_posture.errors import InertiaError, InputError, MjcfError, OutputError, UrdfError
 from impact_posture.robot import guessed_parts as guess
@@ -147,12 +147,7 @@ def _load(located: Located, options: LoadOptions, root: Root | None, srdf: Path 
         package_dir=options.package_dir, armature=options.armature, lock=options.lock, lock_massless=True
     )
     model = replace(located.spec.model, root=root, srdf=None if srdf is None else str(srdf), accept_inertias=True)
-    robot = build_robot(located._replace(spec=RobotSpec(model=model)), plain)
-    # The shapes of the feet are searched with these settings.
-    settings = RobotSettings(
-        robot=located.source, config=os.devnull, package_dir=options.package_dir, xacro_arg=options.xacro_arg
-    )
-    return replace(robot, settings=settings)
+    return build_robot(located._replace(spec=RobotSpec(model=model)), plain)
 
 
 def _model(draft: Draft, robot: Robot, options: LoadOptions, folder: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -50,6 +51,21 @@ FIXED_CONVENTION = "q = [joints]; v = [joint rates]; SI units, radians"
 _ON_LIMIT = 1e-6
 # A follower may differ from its coupling by this (rad, m) in a posture, for example because of rounded numbers.
 _COUPLED = 1e-3
+
+
+@dataclass(frozen=True)
+class RobotFiles:
+    """Files from which a robot was loaded.
+
+    Attributes:
+        urdf: The URDF or MJCF; for a xacro file, the URDF in the cache.
+        srdf: The SRDF; ``None`` without an SRDF.
+        folders: Folders in which ``package://`` paths are searched.
+    """
+
+    urdf: Path
+    srdf: Path | None
+    folders: tuple[Path, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +116,7 @@ class Robot:
         couplings: Couplings of joints, by which a follower moves with its leader.
         settings: Settings of :func:`~impact_posture.robot.robot_loader.load_robot`; ``None`` if another function made
             the robot.
+        files: Files of the robot; ``None`` if another function made the robot.
         mjcf: The compiled MJCF; ``None`` for a URDF.
     """
 
@@ -117,6 +134,7 @@ class Robot:
     stated_armature: Array | None = None
     couplings: tuple[JointCoupling, ...] = ()
     settings: RobotSettings | None = None
+    files: RobotFiles | None = None
     mjcf: CompiledMjcf | None = None
 
     def __repr__(self) -> str:

@@ -30,7 +30,7 @@ from impact_posture.robot.inertia_checks import check_any_mass, check_mass_matri
 from impact_posture.robot.joint_coupling import couple_limits, coupled, present, with_partners
 from impact_posture.robot.model_joints import immovable_joints, joint_index, movable_joints, q_slice, v_slice
 from impact_posture.robot.named_postures import ignored_bases, named_postures
-from impact_posture.robot.robot import CompiledMjcf, Robot
+from impact_posture.robot.robot import CompiledMjcf, Robot, RobotFiles
 from impact_posture.robot.robot_collections import COLLECTIONS, CollectedRobot, collected, names_with
 from impact_posture.robot.robot_description import read_description
 from impact_posture.robot.robot_spec import RobotSpec, read_spec
@@ -73,7 +73,7 @@ def build_robot(located: Located, options: LoadOptions) -> Robot:
     model, root, warnings = described.model, described.root, described.warnings
     _check_names(model, source)
     _remount(model, options.mounting, name)
-    srdf = srdf_path(spec, options, base)
+    srdf = _srdf_path(spec, options, base)
     _override_limits(model, spec, name)
     _check_limits(model, source)
     couplings = described.couplings
@@ -98,7 +98,7 @@ def build_robot(located: Located, options: LoadOptions) -> Robot:
     loaded = Robot(
         name=name, source=source, model=model, root=root, postures=postures, default_posture=default, spec=spec,
         locked=locked, armature_source=armature_source, warnings=warnings, couplings=present(couplings, model),
-        mjcf=mjcf,
+        files=RobotFiles(urdf, srdf, _package_folders(spec, options, base)), mjcf=mjcf,
     )  # fmt: skip
     check_mass_matrix(loaded, source)
     return loaded
@@ -195,10 +195,8 @@ def locate(robot: str, options: LoadOptions) -> Located:
         fault = "is a pipe or a device, which cannot be read more than once"
         raise UrdfError(fault, where=str(urdf), hint="write its content into a file")
     if urdf.suffix == ".xacro":
-        places = [Path(folder).expanduser() for folder in options.package_dir]
-        places += [base / Path(folder).expanduser() for folder in folders]
         arguments = {**files.arguments, **spec.model.xacro_args, **(options.xacro_arg or {})}
-        urdf = expand_xacro(urdf, arguments, places, files.packages)
+        urdf = expand_xacro(urdf, arguments, _package_folders(spec, options, base), files.packages)
     else:
         _check_arguments(options, str(urdf))
     return Located(spec, urdf, robot, base, spec.name or urdf.stem, home)
@@ -210,7 +208,14 @@ def _check_arguments(options: LoadOptions, robot: str) -> None:
         raise InputError("is not a xacro file", where=robot, hint="leave `xacro_arg` out")
 
 
-def srdf_path(spec: RobotSpec, options: LoadOptions, base: Path) -> Path | None:
+def _package_folders(spec: RobotSpec, options: LoadOptions, base: Path) -> tuple[Path, ...]:
+    """Return the folders in which ``package://`` paths are searched: stated folders, and ``ROS_PACKAGE_PATH``."""
+    ros = [folder for folder in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if folder]
+    stated = (base / Path(folder).expanduser() for folder in spec.model.package_dirs)
+    return *(Path(folder).expanduser() for folder in options.package_dir), *stated, *map(Path, ros)
+
+
+def _srdf_path(spec: RobotSpec, options: LoadOptions, base: Path) -> Path | None:
     """Return the SRDF of a robot, or ``None``; raise ``UrdfError`` if the file is absent."""
     text = options.srdf or spec.model.srdf
     if text is None:

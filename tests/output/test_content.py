@@ -333,7 +333,7 @@ def test_a_base_with_legs_is_a_body(name: str) -> None:
 
 
 def without_shapes(view: ResultView) -> ResultView:
-    robot = dataclasses.replace(view.robot, settings=None)
+    robot = dataclasses.replace(view.robot, files=None)
     return dataclasses.replace(view, objective=dataclasses.replace(view.objective, robot=robot))
 
 

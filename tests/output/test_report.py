@@ -28,7 +28,6 @@ from impact_posture.output.report.report_page import Content, Table, render
 from impact_posture.output.report.report_scene import ReportScene
 from impact_posture.output.report.result_report import result_scene
 from impact_posture.output.result_reader import load_result, rewrite_report
-from impact_posture.robot.robot_loader import locate
 from impact_posture.robot.urdf import parse_urdf
 from impact_posture.simulation.series import Series, Window
 from tests.support.browser import Tab, browser
@@ -296,8 +295,8 @@ def test_known_robots_come_with_meshes_and_their_license(name: str, largest: flo
     size = sum(4 / 3 * (solid.corners.nbytes + 2 * solid.faces.size) for solid in drawn.solids)
     # The page contains compressed meshes, and compression reduces every mesh by at least half.
     assert 0.5 * size < largest and sum(len(solid.faces) for solid in drawn.solids) <= 150_000
-    assert robot.settings is not None
-    links = parse_urdf(locate(name, robot.settings).urdf).findall("link")
+    assert robot.files is not None
+    links = parse_urdf(robot.files.urdf).findall("link")
     assert len(drawn.parts) >= sum(len(link.findall("visual")) for link in links)
     for solid in drawn.solids:
         assert solid.faces.max() == len(solid.corners) - 1 and len(np.unique(solid.faces)) == len(solid.corners)
