@@ -9,13 +9,14 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import cached_property, partial
 from itertools import combinations
 from typing import Any
 
 import numpy as np
 
 from impact_posture.collision.shape_corners import Corrected, Triangles, hull_surface, triangle_mesh
-from impact_posture.collision.urdf_shapes import LinkShape, LinkShapes, UnusableShape, left_out
+from impact_posture.collision.urdf_shapes import LinkShape, LinkShapes, UnusableShape
 from impact_posture.robot.mjcf_file import is_floating, object_name
 from impact_posture.robot.mjcf_model import placement
 from impact_posture.system.arrays import Array
@@ -26,14 +27,21 @@ _NO_MESH = np.zeros((0, 3)), np.zeros((0, 3), dtype=int)
 
 @dataclass(frozen=True, eq=False)
 class MjcfShape(LinkShape):
-    """A geom of an MJCF; ``surface`` has the corners, m, shape (k, 3), and the triangles, shape (n, 3), of a mesh."""
+    """A geom of an MJCF.
+
+    Attributes:
+        surface: Corners, m, shape (k, 3), and triangles, shape (n, 3), of a mesh.
+        hull: Whether the convex hull replaces the mesh.
+    """
 
     surface: tuple[Array, Triangles] = _NO_MESH
+    hull: bool = True
 
-    @property
+    @cached_property
     def content(self) -> str:
-        """Hash of the mesh."""
-        return hashlib.sha256(b"".join(np.ascontiguousarray(part).tobytes() for part in self.surface)).hexdigest()
+        """Hash of the mesh, and whether its convex hull replaces it."""
+        parts = *(np.ascontiguousarray(part).tobytes() for part in self.surface), bytes([self.hull])
+        return hashlib.sha256(b"".join(parts)).hexdigest()
 
     @property
     def key(self) -> object:
@@ -41,7 +49,7 @@ class MjcfShape(LinkShape):
         return self.kind, self.sizes, self.content
 
     def _load_mesh(self, largest: float) -> Corrected:
-        return Corrected(triangle_mesh(*self.surface), True)
+        return Corrected(triangle_mesh(*(hull_surface(self.surface[0]) if self.hull else self.surface)), True)
 
 
 def mjcf_shapes(model: Any, first: str = "collision") -> LinkShapes:
@@ -53,15 +61,8 @@ def mjcf_shapes(model: Any, first: str = "collision") -> LinkShapes:
     for b, solid in solid_geoms(model):
         geoms = range(model.body_geomadr[b], model.body_geomadr[b] + model.body_geomnum[b])
         visual = [g for g in geoms if g not in solid] if first == "visual" else []
-        chosen, body = visual or solid, object_name(model, "body", b)
-        if chosen:
-            read.described.append(body)
-        for k, g in enumerate(chosen):
-            name = body if len(chosen) == 1 else f"{body}[{k}]"
-            try:
-                read.shapes.append(_shape(model, g, name, body, hull=first == "collision"))
-            except UnusableShape as fault:
-                read.warnings.append(left_out(name, fault))
+        body = object_name(model, "body", b)
+        read.add(body, visual or solid, partial(_shape, model, body=body, hull=first == "collision"))
     return read
 
 
@@ -96,7 +97,7 @@ def excluded_pairs(model: Any, bodies: Iterable[int]) -> set[tuple[int, int]]:
     }
 
 
-def _shape(model: Any, g: int, name: str, body: str, *, hull: bool) -> MjcfShape:
+def _shape(model: Any, g: int, name: str, *, body: str, hull: bool) -> MjcfShape:
     """Return a geom as the shape ``name``; raise ``UnusableShape`` for planes, height fields and other surfaces."""
     kind = import_mujoco().mjtGeom(int(model.geom_type[g])).name.removeprefix("mjGEOM_").lower()
     x, y, z = (float(v) for v in model.geom_size[g])
@@ -111,9 +112,8 @@ def _shape(model: Any, g: int, name: str, body: str, *, hull: bool) -> MjcfShape
     if kind not in known:
         raise UnusableShape(f"a {kind} is not a shape of a link; give {', '.join(known)}")
     surface = mesh_surface(model, int(model.geom_dataid[g])) if kind == "mesh" else _NO_MESH
-    surface = hull_surface(surface[0]) if kind == "mesh" and hull else surface
     at, color = placement(model.geom_pos[g], model.geom_quat[g]), _color(model, g)
-    return MjcfShape(name, body, at, kind, known[kind], color=color, surface=surface)
+    return MjcfShape(name, body, at, kind, known[kind], color=color, surface=surface, hull=hull)
 
 
 def _color(model: Any, g: int) -> tuple[float, ...]:

@@ -8,12 +8,12 @@ import os
 import re
 import xml.etree.ElementTree as ET
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 from urllib.parse import unquote
 
 import coal
@@ -51,6 +51,8 @@ _SIZES = {
     "mesh": {"scale": 3},
 }
 
+_Part = TypeVar("_Part")
+
 
 class LinkShapes(NamedTuple):
     """The shapes in a URDF or MJCF.
@@ -64,6 +66,17 @@ class LinkShapes(NamedTuple):
     shapes: list[LinkShape]
     warnings: list[str]
     described: list[str]
+
+    def add(self, link: str, parts: Sequence[_Part], read: Callable[[_Part, str], LinkShape]) -> None:
+        """Add the shapes of a link; ``read`` returns the shape of a part of the file, with a given name."""
+        if parts:
+            self.described.append(link)
+        for k, part in enumerate(parts):
+            name = link if len(parts) == 1 else f"{link}[{k}]"
+            try:
+                self.shapes.append(read(part, name))
+            except UnusableShape as fault:
+                self.warnings.append(left_out(name, fault))
 
 
 class UnusableShape(Exception):
@@ -182,14 +195,7 @@ def read_urdf_shapes(robot: Robot, first: str = "collision") -> LinkShapes:
         if not robot.model.existFrame(name, pin.FrameType.BODY):
             raise UrdfError("has changed since the robot was loaded", where=str(files.urdf), hint="load it again")
         tags = link.findall(first) or link.findall("visual") or link.findall("collision")
-        if tags:
-            read.described.append(name)
-        for k, tag in enumerate(tags):
-            unique = name if len(tags) == 1 else f"{name}[{k}]"
-            try:
-                read.shapes.append(_read(tag, unique, name, files, colors))
-            except UnusableShape as fault:
-                read.warnings.append(left_out(unique, fault))
+        read.add(name, tags, partial(_read, link=name, files=files, colors=colors))
     return read
 
 
