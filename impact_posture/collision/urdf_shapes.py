@@ -21,6 +21,7 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.collision.shape_corners import Corrected, correct, mesh_points, mesh_triangles, triangle_mesh
+from impact_posture.config.text_parsers import finite_numbers
 from impact_posture.errors import UrdfError, one_line
 from impact_posture.robot.robot import Robot, RobotFiles
 from impact_posture.robot.urdf import parse_urdf, quiet_stderr
@@ -283,11 +284,7 @@ def _color(material: ET.Element | None, named: Mapping[str, ET.Element]) -> tupl
 
 
 def _numbers(text: str, count: int, where: str) -> list[float]:
-    try:
-        numbers = [float(word) for word in text.split()]
-    except ValueError:
-        numbers = []
-    if len(numbers) != count or not np.isfinite(numbers).all():
+    if not (numbers := finite_numbers(text, count)):
         raise UnusableShape(f"its {where} is '{text}'; give {count} finite number{'s' if count > 1 else ''}")
     return numbers
 

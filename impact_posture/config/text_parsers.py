@@ -1,11 +1,15 @@
-"""Parsers of contacts, armatures and payloads that users write as text."""
+"""Parsers of contacts, armatures, payloads and numbers that users write as text."""
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TypeVar
 
 from impact_posture.errors import ContactError, InputError
+
+_Value = TypeVar("_Value")
 
 
 def parse_contact(text: str) -> tuple[str, tuple[float, float, float], float | None]:
@@ -39,37 +43,47 @@ def parse_armature(texts: Sequence[str]) -> Mapping[str, float] | str | None:
         return None
     if len(texts) == 1 and ("=" not in texts[0] or os.path.isfile(texts[0])):
         return texts[0]
-    values: dict[str, float] = {}
+    values = []
     for text in texts:
         joint, equals, value = text.rpartition("=")
         try:
             if not equals:
                 raise ValueError
-            values[joint] = float(value)
+            values.append((joint, float(value)))
         except ValueError:
             raise InputError(
                 f"'{text}' is not JOINT=VALUE", where="armature", hint="give none, one file, or only JOINT=VALUE"
             ) from None
-    _check_once([text.rpartition("=")[0] for text in texts], "armature")
-    return values
+    return _each_once(values, "armature")
 
 
 def parse_xacro_arguments(texts: Sequence[str]) -> Mapping[str, str]:
     """Read texts ``NAME:=VALUE``; raise ``InputError`` for another form."""
-    values: dict[str, str] = {}
+    values = []
     for text in texts:
         name, sign, value = text.partition(":=")
         if not (name and sign):
             raise InputError(f"'{text}' is not NAME:=VALUE", where="xacro_arg", hint="for example hand:=true")
+        values.append((name, value))
+    return _each_once(values, "xacro_arg")
+
+
+def _each_once(pairs: Iterable[tuple[str, _Value]], where: str) -> dict[str, _Value]:
+    values = dict[str, _Value]()
+    for name, value in pairs:
+        if name in values:
+            raise InputError(f"'{name}' has two values", where=where, hint="remove one")
         values[name] = value
-    _check_once([text.partition(":=")[0] for text in texts], "xacro_arg")
     return values
 
 
-def _check_once(names: Sequence[str], where: str) -> None:
-    for name in names:
-        if names.count(name) > 1:
-            raise InputError(f"'{name}' has two values", where=where, hint="remove one")
+def finite_numbers(text: str, count: int = 1) -> list[float]:
+    """Read ``count`` finite numbers between spaces; return an empty list for any other text."""
+    try:
+        numbers = [float(word) for word in text.split()]
+    except ValueError:
+        return []
+    return numbers if len(numbers) == count and all(map(math.isfinite, numbers)) else []
 
 
 def parse_payloads(texts: Sequence[str]) -> tuple[tuple[str, float], ...]:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 
+from impact_posture.config.text_parsers import finite_numbers
 from impact_posture.errors import InertiaError
 from impact_posture.robot.model_joints import v_slice
 from impact_posture.robot.robot import Robot
@@ -164,11 +164,7 @@ def _link_fault(link: ET.Element, where: str) -> tuple[float, str] | None:
 
 def _numbers(tag: ET.Element, key: str, link: str, where: str, count: int = 1) -> list[float]:
     text = tag.get(key, "")
-    try:
-        values = [float(word) for word in text.split()]
-    except ValueError:
-        values = []
-    if len(values) != count or not all(map(math.isfinite, values)):
+    if not (values := finite_numbers(text, count)):
         fault = f"link '{link}': {tag.tag} {key}='{text}' is not {'a number' if count == 1 else f'{count} numbers'}"
         raise InertiaError(fault, where=where, hint="correct it")
     return values

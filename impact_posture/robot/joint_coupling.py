@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
+from impact_posture.config.text_parsers import finite_numbers
 from impact_posture.errors import UrdfError, nearest
 from impact_posture.robot.model_joints import ENDLESS
 from impact_posture.system.arrays import Array
@@ -76,7 +77,7 @@ def urdf_couplings(root: ET.Element, where: str) -> tuple[tuple[JointCoupling, .
             near = nearest(leader, joints, 1)[0]
             warnings.append(f"{fault} (did you mean {near}?): it moves by itself; correct its <mimic>")
             continue
-        ratio, offset = (_number(tag, key, value, where) for key, value in (("multiplier", 1.0), ("offset", 0.0)))
+        ratio, offset = (_number(tag, key, value, where) for key, value in (("multiplier", "1"), ("offset", "0")))
         if ratio and joints[leader].get("type") != "fixed":
             stated[name] = JointCoupling(name, leader, ratio, offset)
         else:
@@ -93,15 +94,11 @@ def urdf_couplings(root: ET.Element, where: str) -> tuple[tuple[JointCoupling, .
     return couplings, warnings
 
 
-def _number(tag: ET.Element, key: str, default: float, where: str) -> float:
-    try:
-        value = float(tag.get(key, default))
-    except ValueError:
-        value = np.nan
-    if not np.isfinite(value):
+def _number(tag: ET.Element, key: str, default: str, where: str) -> float:
+    if not (numbers := finite_numbers(tag.get(key, default))):
         fault = f"<mimic joint='{tag.get('joint')}'>: {key} '{tag.get(key)}' is not a number"
         raise UrdfError(fault, where=where, hint="correct it")
-    return value
+    return numbers[0]
 
 
 def _set_limits(joint: ET.Element, low: float, high: float) -> None:

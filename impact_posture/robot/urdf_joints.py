@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
+from impact_posture.config.text_parsers import finite_numbers
 from impact_posture.errors import UrdfError, listed
 from impact_posture.system.arrays import Array
 
@@ -83,8 +84,6 @@ def _turn_planar(model: pin.Model, index: int, axis: Array) -> None:
 def _short_range(joint: ET.Element) -> str:
     """Return the stated position limits of a joint as text if they are shorter than a turn, else an empty text."""
     limit = joint.find("limit")
-    try:
-        low, high = (float("nan" if limit is None else limit.get(key, "nan")) for key in ("lower", "upper"))
-    except ValueError:
-        return ""
+    stated = "" if limit is None else f"{limit.get('lower', '')} {limit.get('upper', '')}"
+    low, high = finite_numbers(stated, 2) or (0.0, 0.0)
     return f"[{low:g}, {high:g}]" if 0 < high - low < 2 * math.pi - _SHORT_OF_A_TURN else ""
