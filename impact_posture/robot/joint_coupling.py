@@ -129,7 +129,7 @@ def couple_limits(model: pin.Model, couplings: Iterable[JointCoupling]) -> list[
     """
     warnings = []
     low, high = model.lowerPositionLimit.copy(), model.upperPositionLimit.copy()
-    slow, fast = model.lowerVelocityLimit.copy(), model.upperVelocityLimit.copy()
+    speed = model.upperVelocityLimit.copy()
     couplings = tuple(couplings)
     for c in couplings:
         f, lead = _in_q(model, c.follower), _in_q(model, c.leader)
@@ -142,20 +142,17 @@ def couple_limits(model: pin.Model, couplings: Iterable[JointCoupling]) -> list[
                 fault = f"the position limits {stated} of '{c.follower}' contradict the limits {other} of its leader"
                 warnings.append(f"{fault} '{c.leader}', so the limits of '{c.follower}' are not used")
         f, lead = _in_v(model, c.follower), _in_v(model, c.leader)
-        if 0 < fast[f] < ENDLESS:
-            limit = fast[f] / abs(c.ratio)
-            fast[lead] = min(fast[lead], limit) if fast[lead] > 0 else limit
-            slow[lead] = -fast[lead]
+        if 0 < speed[f] < ENDLESS:
+            limit = speed[f] / abs(c.ratio)
+            speed[lead] = min(speed[lead], limit) if speed[lead] > 0 else limit
     # Pinocchio writes "no limit" as the largest double, so a product may overflow to infinity.
     with np.errstate(over="ignore"):
         for c in couplings:
             f, lead = _in_q(model, c.follower), _in_q(model, c.leader)
             low[f], high[f] = sorted(c.ratio * bound + c.offset for bound in (low[lead], high[lead]))
-            f, lead = _in_v(model, c.follower), _in_v(model, c.leader)
-            fast[f] = abs(c.ratio) * fast[lead]
-            slow[f] = -fast[f]
+            speed[_in_v(model, c.follower)] = abs(c.ratio) * speed[_in_v(model, c.leader)]
     model.lowerPositionLimit, model.upperPositionLimit = low, high
-    model.lowerVelocityLimit, model.upperVelocityLimit = slow, fast
+    model.upperVelocityLimit = speed
     return warnings
 
 

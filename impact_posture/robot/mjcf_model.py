@@ -127,7 +127,7 @@ def _set_limits(model: pin.Model, mjcf: Any) -> None:
         if model.nvs[j + 1] == 1:
             effort[model.idx_vs[j + 1]] = largest
     model.lowerPositionLimit, model.upperPositionLimit = lower, upper
-    model.upperEffortLimit, model.lowerEffortLimit = effort, -effort
+    model.upperEffortLimit = effort
 
 
 def _efforts(mjcf: Any) -> list[float]:

@@ -78,6 +78,7 @@ def build_robot(located: Located, options: LoadOptions) -> Robot:
     _check_limits(model, source)
     couplings = described.couplings
     warnings = (*warnings, *couple_limits(model, couplings))
+    model.lowerVelocityLimit, model.lowerEffortLimit = -model.upperVelocityLimit, -model.upperEffortLimit
     postures, default = named_postures(described, srdf, spec, name)
     postures = {key: coupled(model, couplings, q) for key, q in postures.items()}
     armature_source = set_armature(model, spec, srdf, options.armature, name)
@@ -253,12 +254,10 @@ def _override_limits(model: pin.Model, spec: RobotSpec, name: str) -> None:
         lower[model.idx_qs[index]], upper[model.idx_qs[index]] = low, high
     model.lowerPositionLimit, model.upperPositionLimit = lower, upper
     for values, kind in ((spec.limits.velocity, "Velocity"), (spec.limits.effort, "Effort")):
-        low, high = getattr(model, f"lower{kind}Limit").copy(), getattr(model, f"upper{kind}Limit").copy()
+        limits = getattr(model, f"upper{kind}Limit").copy()
         for joint, value in values.items():
-            k = model.idx_vs[joint_index(model, joint, where)]
-            low[k], high[k] = -value, value
-        setattr(model, f"lower{kind}Limit", low)
-        setattr(model, f"upper{kind}Limit", high)
+            limits[model.idx_vs[joint_index(model, joint, where)]] = value
+        setattr(model, f"upper{kind}Limit", limits)
 
 
 def _check_names(model: pin.Model, source: str) -> None:
