@@ -118,30 +118,28 @@ def _compile(spec: Any, path: Path) -> tuple[Any, list[str]]:
     for texture in spec.textures:
         texture.file, texture.cubefiles = "", [""] * 6
         texture.builtin, texture.width, texture.height = import_mujoco().mjtBuiltin.mjBUILTIN_FLAT, 1, 1
-    for asset in (*spec.meshes, *spec.hfields):
-        if asset.file and _asset(spec, asset).exists() and not _asset(spec, asset).is_file():
-            raise MjcfError(f"mesh '{asset.file}' is not a file", where=str(path), hint="correct its path")
-    missing = {mesh.name: mesh.file for mesh in spec.meshes if mesh.file and not _asset(spec, mesh).is_file()}
-    missing |= {field.name: field.file for field in spec.hfields if field.file and not _asset(spec, field).is_file()}
+    assets, missing = [*spec.meshes, *spec.hfields], dict[str, str]()
+    for asset in assets:
+        file = _asset(spec, asset)
+        if asset.file and not file.is_file():
+            missing[asset.name] = asset.file
+            if file.exists():
+                raise MjcfError(f"mesh '{asset.file}' is not a file", where=str(path), hint="correct its path")
     try:
         return spec.compile(), []
     except ValueError:
         if not missing:
             raise
     for geom in list(spec.geoms):
-        file = missing.get(geom.meshname) or missing.get(geom.hfieldname)
-        if file is None:
+        if not (name := missing.get(geom.meshname) or missing.get(geom.hfieldname)):
             continue
         body = geom.parent
         if body.name != "world" and not (body.explicitinertial and spec.compiler.inertiafromgeom != _FROM_GEOMS):
-            fault = f"no mesh '{file}', and body '{body.name}' takes its inertia from it"
+            fault = f"no mesh '{name}', and body '{body.name}' takes its inertia from it"
             raise MjcfError(fault, where=str(path), hint="add the mesh, or state <inertial>")
         spec.delete(geom)
-    for asset in (*list(spec.meshes), *list(spec.hfields)):
-        if asset.name in missing:
-            spec.delete(asset)
-    for skin in list(spec.skins):
-        spec.delete(skin)
+    for part in (*(asset for asset in assets if asset.name in missing), *spec.skins):
+        spec.delete(part)
     files = listed([f"'{file}'" for file in sorted(missing.values())], 1)
     return spec.compile(), [f"no mesh {files}: their shapes are left out; inertias are stated"]
 

@@ -32,6 +32,7 @@ def model_of(mjcf: Any) -> pin.Model:
     model = pin.Model()
     model.name = "robot"
     model.gravity = pin.Motion(np.r_[mjcf.opt.gravity, np.zeros(3)])
+    equated = {j for joint, other in equated_joints(mjcf) for j in (joint, int(other[0]))}
     # Body → joint that moves it, placement in the axes of this joint, frame.
     bodies: list[tuple[int, pin.SE3, int]] = [(0, pin.SE3.Identity(), 0)]
     if mjcf.body_geomnum[0] and not is_floating(mjcf):
@@ -44,7 +45,7 @@ def model_of(mjcf: Any) -> pin.Model:
                 joint = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), ROOT_JOINT)
                 at = pin.SE3.Identity()
             else:
-                kind, before, after = _joint(mjcf, j)
+                kind, before, after = _joint(mjcf, j, j in equated)
                 joint = model.addJoint(joint, kind, at * before, object_name(mjcf, "joint", j))
                 at = after
             frame = model.addJointFrame(joint, frame)
@@ -77,7 +78,7 @@ def configuration(model: pin.Model, mjcf: Any, entries: Mapping[str, Array] | No
     return np.asarray(pin.normalize(model, q))
 
 
-def _joint(mjcf: Any, j: int) -> tuple[pin.JointModel, pin.SE3, pin.SE3]:
+def _joint(mjcf: Any, j: int, equated: bool) -> tuple[pin.JointModel, pin.SE3, pin.SE3]:
     """Return the type of a joint, its placement in its body at ``qpos0``, and the placement of the body after it."""
     types, axis = import_mujoco().mjtJoint, np.array(mjcf.jnt_axis[j])
     shift = pin.SE3(np.eye(3), np.array(mjcf.jnt_pos[j]))
@@ -88,7 +89,6 @@ def _joint(mjcf: Any, j: int) -> tuple[pin.JointModel, pin.SE3, pin.SE3]:
         family, back = "P", pin.SE3(np.eye(3), -reference * axis)
     else:
         # A coupled joint depends on the whole angle, not only on its cosine and sine.
-        equated = any(j in (joint, other[0]) for joint, other in equated_joints(mjcf))
         family = "R" if mjcf.jnt_limited[j] or equated else "RUB"
         back = pin.SE3(pin.AngleAxis(-reference, axis).matrix(), np.zeros(3))
     if axis.max() == 1.0:

@@ -16,7 +16,7 @@ from impact_posture.system.arrays import Array
 _ROUNDING = 1e-14
 
 
-def dynamics_hash(model: pin.Model, armature: Array, couplings: Sequence[JointCoupling] = ()) -> str:
+def dynamics_hash(model: pin.Model, armature: Array, couplings: Sequence[JointCoupling]) -> str:
     """Return the hash of joints, placements, inertias, couplings and ``armature``, shape (nv,)."""
     joints = []
     for i in range(1, model.njoints):
@@ -27,7 +27,7 @@ def dynamics_hash(model: pin.Model, armature: Array, couplings: Sequence[JointCo
 
 
 def kinematics_hash(
-    model: pin.Model, postures: Mapping[str, Array], default: str, couplings: Sequence[JointCoupling] = ()
+    model: pin.Model, postures: Mapping[str, Array], default: str, couplings: Sequence[JointCoupling]
 ) -> str:
     """Return the hash of joints, frames, position limits, couplings, postures and the name of the default posture."""
     placed = [(f.name, int(f.parentJoint), rounded(f.placement.homogeneous)) for f in model.frames]

@@ -31,6 +31,7 @@ from impact_posture.robot.joint_coupling import (
 )
 from impact_posture.robot.model_hash import dynamics_hash, hash_of, kinematics_hash, rounded
 from impact_posture.robot.model_joints import (
+    ENDLESS,
     JOINT_ENTRIES,
     immovable_joints,
     joint_family,
@@ -85,15 +86,9 @@ class CompiledMjcf:
     @cached_property
     def passive(self) -> tuple[Array, ...]:
         """Arrays of the model that determine damping, friction loss and springs of the joints."""
-        names = (
-            "dof_damping",
-            "dof_dampingpoly",
-            "dof_frictionloss",
-            "jnt_stiffness",
-            "jnt_stiffnesspoly",
-            "qpos_spring",
-        )
-        return tuple(np.array(getattr(self.model, name)) for name in names)
+        m = self.model
+        springs = m.jnt_stiffness, m.jnt_stiffnesspoly, m.qpos_spring
+        return tuple(map(np.array, (m.dof_damping, m.dof_dampingpoly, m.dof_frictionloss, *springs)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,7 +229,7 @@ class Robot:
         """Velocity limits, rad/s or m/s, shape (nv,); infinite for entries without a limit."""
         limits = np.array(self.model.velocityLimit)
         limits[: self.first_joint] = np.inf
-        return np.where((limits > 0) & (limits < 1e10), limits, np.inf)
+        return np.where((limits > 0) & (limits < ENDLESS), limits, np.inf)
 
     @cached_property
     def mass(self) -> float:
