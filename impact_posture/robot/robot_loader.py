@@ -87,6 +87,10 @@ def build_robot(located: Located, options: LoadOptions) -> Robot:
     if spec.model.lock_massless or options.lock_massless:
         massless = (joint for joint in massless_joints(model) if joint != "root_joint")
         locked = tuple(dict.fromkeys((*locked, *massless)))
+    beside = _beside(model) if root == "free-flyer" else ()
+    if beside:
+        warnings = (*warnings, f"joints that do not hang on the floating base are locked: {listed(beside)}")
+        locked = tuple(dict.fromkeys((*locked, *beside)))
     mjcf = None if described.mjcf is None else CompiledMjcf(described.mjcf, model, postures[default])
     locked = with_partners(couplings, locked)
     if locked:
@@ -277,6 +281,11 @@ def _check_limits(model: pin.Model, source: str) -> None:
             limits = f"{model.lowerPositionLimit[k]:g}, {model.upperPositionLimit[k]:g}"
             fault = f"the lower position limit of '{model.names[index]}' is above its upper limit ({limits})"
             raise UrdfError(fault, where=source, hint="swap them there, or give robot.toml [limits.position]")
+
+
+def _beside(model: pin.Model) -> tuple[str, ...]:
+    """Return the joints of a floating robot that hang on the world, such as parts of the scene in an MJCF."""
+    return tuple(model.names[k] for k in range(2, model.njoints) if 1 not in model.supports[k])
 
 
 def _immovable(model: pin.Model) -> list[str]:

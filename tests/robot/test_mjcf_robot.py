@@ -274,6 +274,17 @@ def test_refusals_name_the_fault_in_one_line(tmp_path: Path, text: str, line: st
     assert line in error.value.line and "\n" not in error.value.line and error.value.hint
 
 
+def test_joints_beside_a_floating_robot_are_locked(tmp_path: Path) -> None:
+    """Some vendors keep the joints of optional parts by bodies that hang on the world."""
+    spare = '<body name="spare" pos="0 0 20"><joint name="gone"/><geom size=".1" mass=".001"/></body></worldbody>'
+    robot, plain = loaded(tmp_path, QUADRUPED.replace("</worldbody>", spare)), loaded(tmp_path, QUADRUPED)
+    assert "joints that do not hang on the floating base are locked: gone" in robot.warnings
+    assert robot.joint_names == plain.joint_names and robot.locked == ("gone",)
+    q = plain.posture()
+    ours, reference = (pin.crba(each.model, each.model.createData(), q) for each in (robot, plain))
+    np.testing.assert_allclose(ours, reference, rtol=1e-13)
+
+
 def test_inactive_equality_is_no_loop(tmp_path: Path) -> None:
     equality = '<weld body1="hand" body2="base" active="false"/>'
     assert loaded(tmp_path, _with(ARM, equality=equality)).nv == 4
