@@ -18,6 +18,7 @@ from impact_posture.dynamics.chart import BOUNDED, Chart, JointSlot
 from impact_posture.dynamics.mjcf_layout import MjcfLayout
 from impact_posture.errors import InputError
 from impact_posture.robot.model_joints import ENDLESS
+from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 from impact_posture.system.escape import xml_name
 from impact_posture.system.optional_package import import_mujoco
@@ -89,14 +90,14 @@ class Mjcf:
             name=name, type=import_mujoco().mjtGeom.mjGEOM_MESH, meshname=name, mass=0.0, contype=0, conaffinity=0
         )
 
-    def couple(self, follower: int, leader: int, ratio: float, offset: float) -> None:
-        """Let a joint follow another joint, ``q_follower = ratio · q_leader + offset``, as stiffly as MuJoCo can."""
-        mujoco = import_mujoco()
-        names = (self.joints[joint][0] for joint in (follower, leader))
-        data = np.array([offset, ratio, *np.zeros(10)])
-        equality = self.spec.add_equality(type=mujoco.mjtEq.mjEQ_JOINT, objtype=mujoco.mjtObj.mjOBJ_JOINT, data=data)
-        equality.name1, equality.name2 = names
-        equality.solref, equality.solimp = (2 * self.spec.option.timestep, 1.0), _STIFF
+    def couple_joints(self, robot: Robot) -> None:
+        """Let the followers of a robot follow their leaders, as stiffly as MuJoCo can with the present time step."""
+        types = import_mujoco()
+        joint, kind = types.mjtObj.mjOBJ_JOINT, types.mjtEq.mjEQ_JOINT
+        for c in robot.couplings:
+            equality = self.spec.add_equality(type=kind, objtype=joint, data=[c.offset, c.ratio, *np.zeros(10)])
+            equality.name1, equality.name2 = (self.joints[robot.joint_id(k)][0] for k in (c.follower, c.leader))
+            equality.solref, equality.solimp = (2 * self.spec.option.timestep, 1.0), _STIFF
 
     def add_plane(self, name: str, point: Array, normal: Array) -> None:
         """Add an infinite plane to the world through ``point`` with unit ``normal``, in world axes, shape (3,)."""

@@ -257,8 +257,7 @@ def test_the_simulated_world_moves_coupled_joints_together(tmp_path: Path) -> No
     loaded = load(tmp_path, *gripper(), toml="[armature]\ndefault = 0.01\n")
     written = build_mjcf(loaded.model)
     written.spec.option.timestep, written.spec.option.gravity = 1e-4, np.zeros(3)
-    for c in loaded.couplings:
-        written.couple(loaded.joint_id(c.follower), loaded.joint_id(c.leader), c.ratio, c.offset)
+    written.couple_joints(loaded)
     model = written.compile()
     data, q = mujoco.MjData(model), loaded.coupled(np.array([0.7, -0.4, 0.02, 0, 0]))
     data.qpos[:] = written.layout.qpos(q)

@@ -90,8 +90,7 @@ class Scene:
         self._mobility = self._J @ oracle.solve(self._J.T)
         self._point, self._feet = oracle.point, oracle.feet
         written = build_mjcf(self._robot.model)
-        for c in self._robot.couplings:
-            written.couple(self._robot.joint_id(c.follower), self._robot.joint_id(c.leader), c.ratio, c.offset)
+        written.couple_joints(self._robot)
         self._layout = written.layout
         self._model = _with_surface(written, objective, q).compile()
         self._ball_body = int(self._model.geom("ball").bodyid[0])

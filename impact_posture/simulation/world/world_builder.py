@@ -78,8 +78,7 @@ def build_scene(robot: Robot, scene: Scene, q: Array, throw: Throw | None = None
     mjcf = build_mjcf(robot.model, robot.name)
     _set_physics(mjcf.spec, scene.physics)
     _set_passive(mjcf, robot)
-    for c in robot.couplings:
-        mjcf.couple(robot.joint_id(c.follower), robot.joint_id(c.leader), c.ratio, c.offset)
+    mjcf.couple_joints(robot)
     normals = {s.name: np.array(s.normal, dtype=float) / np.linalg.norm(s.normal) for s in scene.surfaces}
     first = next(iter(normals.values()), None)
     geoms, placed = [], []
