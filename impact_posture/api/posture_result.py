@@ -276,6 +276,6 @@ def optimize(
         return PostureResult(problem, solved.solution, solved.robustness)
     best = search_globally(solved.solution, seed=seed, jobs=jobs, compile=compile)
     robustness = solved.robustness and compare_variants(
-        best.solution, [variant.q for variant in solved.robustness.model_variants], seed
+        best.solution, [variant.own_q for variant in solved.robustness.model_variants], seed
     )
     return PostureResult(problem, best.solution, robustness, global_search=best.search)

@@ -269,16 +269,16 @@ def test_how_far_the_optimum_moves() -> None:
     assert [s.name for s in robustness.model_variants] == [s.name for s in problem.impact.model_variants]
     assert [s.at_robust for s in robustness.model_variants] == at_robust and robustness.worst_robust == max(at_robust)
     for one, member in zip(robustness.model_variants, members, strict=True):
-        assert one.q is not None and one.own is not None and one.own == member.value(one.q)
-        assert one.own <= one.at_robust * (1 + 1e-7), "its own optimum is best for it"
-        assert one.moved == pytest.approx(np.linalg.norm(pin.difference(problem.robot.model, q, one.q)), rel=1e-9)
+        assert one.own_q is not None and one.own_optimum == member.value(one.own_q)
+        assert one.own_optimum <= one.at_robust * (1 + 1e-7), "its own optimum is best for it"
+        assert one.moved == pytest.approx(np.linalg.norm(pin.difference(problem.robot.model, q, one.own_q)), rel=1e-9)
     first = robustness.model_variants[0]
-    assert first.own is not None and first.q is not None
+    assert first.own_optimum is not None and first.own_q is not None
     assert (
-        robustness.worst_nominal == problem.objective.value(first.q)
+        robustness.worst_nominal == problem.objective.value(first.own_q)
         and robustness.worst_nominal >= robustness.worst_robust
     )
-    assert robustness.price == pytest.approx(at_robust[0] / first.own - 1) and robustness.moved == first.moved
+    assert robustness.price == pytest.approx(at_robust[0] / first.own_optimum - 1) and robustness.moved == first.moved
     assert robustness.gain == pytest.approx(1 - robustness.worst_robust / robustness.worst_nominal)
     drawn = [
         replace(problem.objective, robot=one, model_variants=()).value(q)

@@ -175,7 +175,7 @@ def test_the_weight_counts_if_the_contact_is_stated() -> None:
     assert "feet" not in [condition.key for condition in told.conditions] and "With feet" not in told.line
     brief = replace(impact, contact_stiffness=ContactStiffness(duration=1e-4)).evaluate()
     assert brief.standing is not None and brief.standing.moves
-    assert "with the weight over the 0.1 ms of the contact" in brief.standing.fact
+    assert "with the weight over the 0.1 ms of the contact" in brief.standing.line
 
 
 def test_feet_that_hardly_move_count_if_the_base_feels_them() -> None:

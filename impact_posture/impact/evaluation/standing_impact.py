@@ -37,6 +37,7 @@ class StandingImpact(JsonBlock):
     slides: tuple[str, ...]
     time: float
     holding_time: float | None
+    derived = ("line",)
 
     @property
     def moves(self) -> bool:
@@ -44,7 +45,7 @@ class StandingImpact(JsonBlock):
         return bool(self.lifts or self.slides)
 
     @property
-    def fact(self) -> str:
+    def line(self) -> str:
         """Effect of the impact on the feet, in words."""
         counted = f" with the weight over the {milliseconds(self.time)} of the contact" if self.time > 0 else ""
         moved = (("lifts or tips", self.lifts), ("slides", self.slides))
@@ -55,10 +56,6 @@ class StandingImpact(JsonBlock):
             "" if self.holding_time is None else f" if the contact is shorter than {milliseconds(self.holding_time)}"
         )
         return f"the impact {' and '.join(does)}{counted}{shorter}"
-
-    def to_dict(self) -> dict[str, object]:
-        """Return JSON content."""
-        return super().to_dict() | {"line": self.fact}
 
 
 def standing_impact(

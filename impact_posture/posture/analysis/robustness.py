@@ -33,21 +33,16 @@ _NOISE = 1e-6
 class VariantOptimum(JsonBlock):
     """A model variant and its own optimum, which is the best posture for this variant alone.
 
-    ``at_robust`` is the objective of the variant at the robust optimum.  ``own`` is the objective of the variant at
-    its own optimum ``q``, shape (nq,).  ``moved`` is the tangent distance between the robust optimum and ``q``.
-    ``own``, ``q`` and ``moved`` are ``None`` if no start ended at a certified posture.
+    ``at_robust`` is the objective of the variant at the robust optimum.  ``own_optimum`` is its objective at its own
+    optimum ``own_q``, shape (nq,).  ``moved`` is the tangent distance between the robust optimum and ``own_q``.
+    ``own_optimum``, ``own_q`` and ``moved`` are ``None`` if no start ended at a certified posture.
     """
 
     name: str
     at_robust: float
-    own: float | None
-    q: Array | None
+    own_optimum: float | None
+    own_q: Array | None
     moved: float | None
-
-    def to_dict(self) -> dict[str, object]:
-        """Return JSON content."""
-        keys = {"own": "own_optimum", "q": "own_q"}
-        return {keys.get(key, key): value for key, value in super().to_dict().items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +73,7 @@ class Robustness:
     @property
     def price(self) -> float | None:
         """Relative increase of the nominal model's objective from the nominal optimum to the robust optimum."""
-        own = self.model_variants[0].own
+        own = self.model_variants[0].own_optimum
         return None if own is None else self.model_variants[0].at_robust / own - 1
 
     @property

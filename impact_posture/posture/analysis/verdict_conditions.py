@@ -93,9 +93,9 @@ def _singular(after: Evaluation) -> Iterator[Condition]:
 def _feet(before: Evaluation, after: Evaluation) -> Iterator[Condition]:
     now = after.standing
     if now is not None and now.moves:
-        too = ", before and after" if before.standing is not None and now.fact == before.standing.fact else ""
+        too = ", before and after" if before.standing is not None and now.line == before.standing.line else ""
         hint = "`keep_contacts` admits only postures whose feet stay"
-        yield Condition("feet", f"holds only if the feet stay; {now.fact}{too}", hint)
+        yield Condition("feet", f"holds only if the feet stay; {now.line}{too}", hint)
 
 
 def _touch(impact: ResolvedImpact, after: Evaluation) -> Iterator[Condition]:
