@@ -116,16 +116,12 @@ class BatchDescent:
         """Number of descents under way."""
         return len(self._state.x)
 
-    def add(self, x: Array, tag: NDArray[np.int_]) -> int:
-        """Project postures, shape (N, nx), and begin a descent from each that reaches the equalities.
-
-        Return the number of descents that began.
-        """
+    def add(self, x: Array, tag: NDArray[np.int_]) -> None:
+        """Project postures, shape (N, nx), and begin a descent from each that reaches the equalities."""
         projected = self.manifold.project(x, _PROJECTING, within=True, tolerance=_NEAR)
         begun = self._begin(projected.x[projected.converged], tag[projected.converged])
         begun = begun.taken(np.isfinite(begun.merit))
         self._state = self._state.joined(begun)
-        return len(begun.x)
 
     def step(self) -> Ends:
         """Take a step in each descent, and return the descents that ended on the equalities."""

@@ -19,13 +19,11 @@ from impact_posture.dynamics.spatial import quaternion_matrix
 from impact_posture.dynamics.tree import Tree
 from impact_posture.posture.constraints.constraint import ExpressionConstraint
 from impact_posture.posture.manifold.batch_function import BatchFunction
-from impact_posture.posture.manifold.feasible_start import BASE_SPREAD, draw_ranges, near_steps
+from impact_posture.posture.manifold.feasible_start import BASE_SPREAD, ROUNDING, draw_ranges, near_steps
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem, held_rows
 from impact_posture.system.arrays import Array
 
 _CONVERGED = 1e-10
-# Share of the trace that is added to the diagonal of a matrix that may be singular.
-_ROUNDING = 1e-13
 _LONGEST_STEP = 0.5
 # Weight of the squared violation of an inequality in the merit of a posture, 1/m² or 1/rad².
 _PENALTY = 200.0
@@ -39,14 +37,10 @@ class Projected:
 
     Attributes:
         x: Postures, shape (N, nx).
-        residual: Largest violation of an equality, shape (N,).
-        jacobian: Tangent Jacobian of the equalities, shape (N, m, nv).
         converged: Whether each posture satisfies the equalities, shape (N,).
     """
 
     x: Array
-    residual: Array
-    jacobian: Array
     converged: NDArray[np.bool_]
 
 
@@ -197,7 +191,7 @@ class ConstraintManifold:
                 x[left] = np.clip(x[left], self.lower, self.upper)
             value[left], jacobian[left] = self.equalities(x[left])
             residual[left] = np.abs(value[left]).max(axis=1, initial=0.0)
-        return Projected(x, residual, jacobian, residual <= tolerance)
+        return Projected(x, residual <= tolerance)
 
     def back(self, x: Array, value: Array, jacobian: Array, inverse: Array, *, within: bool = True) -> Array:
         """Return the Gauss–Newton steps to the equalities, shape (N, nv), shortened to the longest step.
@@ -246,7 +240,7 @@ def right_inverse(jacobian: Array) -> Array:
     gram = jacobian @ jacobian.transpose(0, 2, 1)
     rows = np.arange(gram.shape[1])
     # The matrix may be singular: rows can be duplicates, and rows of a planar arm can be zero.
-    gram[:, rows, rows] += _ROUNDING * np.maximum(1.0, np.trace(gram, axis1=1, axis2=2))[:, None]
+    gram[:, rows, rows] += ROUNDING * np.maximum(1.0, np.trace(gram, axis1=1, axis2=2))[:, None]
     return np.asarray(jacobian.transpose(0, 2, 1) @ np.linalg.inv(gram))
 
 

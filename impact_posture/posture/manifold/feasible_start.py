@@ -27,7 +27,7 @@ CANDIDATES = 3
 # Standard deviations of the base of a floating robot in random postures: position, m, and rotation, rad.
 BASE_SPREAD = np.array([0.15, 0.15, 0.15, 0.15, 0.15, 0.6])
 # Share of the trace that is added to the diagonal of a matrix that may be singular.
-_ROUNDING = 1e-13
+ROUNDING = 1e-13
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class Projector:
                 plain = diagonal.copy()
                 # Rows can be duplicates, for example of two frames on one link, so the damping must exceed rounding
                 # errors.
-                least = _ROUNDING * max(1.0, float(plain.sum()))
+                least = ROUNDING * max(1.0, float(plain.sum()))
             diagonal[:] = plain + (damping * min(1.0, size) + least)
             step = -free.T @ np.linalg.solve(gram, value)
             step *= min(1.0, 1.0 / max(float(np.abs(step).max()), 1e-12))
