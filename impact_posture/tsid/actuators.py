@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from impact_posture.errors import InputError
-from impact_posture.robot.actuation import actuation_matrix, thrust_limits
+from impact_posture.robot.actuation import actuation_matrix, thrust_limits, torque_limits
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 
@@ -52,8 +52,7 @@ class Actuators:
         self.inverse = np.ascontiguousarray(right[: self.rank].T / values[: self.rank] @ left[:, : self.rank].T)
         self.blind = np.ascontiguousarray(left[:, self.rank :])
         self.spare = np.ascontiguousarray(right[self.rank :].T)
-        effort = np.asarray(robot.model.effortLimit, dtype=float)[self.base :]
-        effort = np.where(effort > 0, effort, np.inf)
+        effort = torque_limits(robot.model)[self.base :]
         low, high = (0.0, 0.0) if propulsion is None else thrust_limits(propulsion)
         self.lower = np.concatenate([np.full(self.rotors, low), -effort])
         self.upper = np.concatenate([np.full(self.rotors, high), effort])

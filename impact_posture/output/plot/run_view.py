@@ -14,6 +14,7 @@ from impact_posture.errors import InputError
 from impact_posture.impact.evaluation.impact_effect import tangent_units
 from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.output.plot.result_view import SEPARATOR, number
+from impact_posture.robot.actuation import torque_limits
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_spec import Support
 from impact_posture.system.arrays import Array
@@ -136,8 +137,7 @@ class RunView:
     @property
     def torque_limits(self) -> Array:
         """Torque limit of each joint, N·m (N), shape (joints,); infinite without a limit."""
-        effort = np.array(self.robot.model.effortLimit, dtype=float)[self.robot.first_joint :]
-        return np.where(effort > 0, effort, np.inf)
+        return torque_limits(self.robot.model)[self.robot.first_joint :]
 
     @property
     def rotor_limits(self) -> tuple[float, float] | None:

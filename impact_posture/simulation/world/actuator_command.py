@@ -9,6 +9,7 @@ import numpy as np
 
 from impact_posture.config.problem_settings import Vector3
 from impact_posture.errors import InputError
+from impact_posture.robot.actuation import torque_limits
 from impact_posture.robot.robot import Robot
 from impact_posture.simulation.world.contact_forces import ShapeTruth
 from impact_posture.simulation.world.rotors import Rotors
@@ -42,9 +43,7 @@ class CommandLimits:
     def __init__(self, robot: Robot, rotors: Rotors | None) -> None:
         propulsion = robot.spec.propulsion
         self._rotors, self._count = rotors, 0 if propulsion is None else len(propulsion.rotors)
-        effort = np.asarray(robot.model.effortLimit, dtype=float)[robot.first_joint :]
-        # An effort limit of zero means that the model gives no limit.
-        self.effort: Array = np.where(effort > 0, effort, np.inf)
+        self.effort = torque_limits(robot.model)[robot.first_joint :]
 
     def within(self, command: Command | ActuatorCommand) -> tuple[Array, Array]:
         """Return rotor speeds, shape (rotors,), and joint torques, shape (joints,), within their limits.

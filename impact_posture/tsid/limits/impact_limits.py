@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
+from impact_posture.robot.actuation import torque_limits
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 from impact_posture.tsid.joint_ranges import JointRanges
@@ -78,8 +79,7 @@ class ImpactLimits:
         period: float = 1e-3,
     ) -> None:
         self._first = robot.first_joint
-        effort = np.asarray(robot.model.effortLimit, dtype=float)[self._first :]
-        self._torque = np.where(effort > 0, effort, np.inf)
+        self._torque = torque_limits(robot.model)[self._first :]
         self._rate = JointRanges(robot).velocity[self._first :]
         self._contacts, self._point, self.points = tuple(contacts), point, (point, *(c.point for c in contacts))
         self._normal, self._period = np.array(normal, dtype=float), period
