@@ -86,7 +86,7 @@ def lines(request: Request) -> Iterator[str]:
     yield machine()
     yield ""
     outcomes = Counter[str]()
-    wanted = [name for name in sources() if request.only in name]
+    wanted = [(name, source) for name, source in sources().items() if request.only in name]
     with ThreadPoolExecutor(request.jobs) as pool:
         yield from table(_HEAD, _rows(pool.map(partial(_run, request=request), wanted), outcomes, request))
     yield ""
@@ -102,10 +102,11 @@ def _rows(results: Iterator[dict[str, str]], outcomes: Counter[str], request: Re
         yield [*(result.get(key, "–") for key in _HEAD[:-1]), f"{result['outcome']}{why and f': {why}'}"]
 
 
-def _run(name: str, request: Request) -> dict[str, str]:
-    """Run one model in its own process and return its row."""
+def _run(model: tuple[str, str], request: Request) -> dict[str, str]:
+    """Run one model, given by name and source, in its own process and return its row."""
+    name, source = model
     say(name)
-    command = [sys.executable, "-m", "docs.studies.robots", sources()[name], str(request.count), str(request.seed)]
+    command = [sys.executable, "-m", "docs.studies.robots", source, str(request.count), str(request.seed)]
     began, row = time.monotonic(), {"model": name}
     try:
         done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=LIMIT, check=False)
@@ -116,7 +117,7 @@ def _run(name: str, request: Request) -> dict[str, str]:
         reason = (done.stderr.strip().splitlines() or [f"exit {done.returncode}"])[-1]
         return row | {"outcome": "fault", "why": reason}
     result = json.loads(done.stdout)
-    return row | result | {"why": result["why"].replace(sources()[name], name)}
+    return row | result | {"why": result["why"].replace(source, name)}
 
 
 def study(source: str, starts: int, seed: int, folder: Path) -> dict[str, str]:

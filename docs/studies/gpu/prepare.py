@@ -29,7 +29,7 @@ from impact_posture.robot.urdf import resolve_path
 # Name of a case → robot, and whether its feet stay.
 ROBOTS = {
     "tilthex_arm": ("tilthex_arm", False), "panda": ("panda", False), "solo8": ("solo8", True),
-    "talos": ("talos", True), "talos without feet": ("talos", False),
+    "talos": ("talos", True), "talos_free": ("talos", False),
 }  # fmt: skip
 # Cases that frax computes too.
 _FRAX = ("panda", "talos")
@@ -77,21 +77,20 @@ def prepare(folder: Path) -> list[dict[str, Any]]:
     cases = []
     for name, (source, feet) in ROBOTS.items():
         robot = load_robot(source)
-        word = name.split()[0] + ("" if len(name.split()) == 1 else "_free")
-        samples, urdf = f"{word}.samples", f"{word}.urdf"
+        samples, urdf = f"{name}.samples", f"{name}.urdf"
         if name in _FRAX:
             write_urdf(robot, folder / urdf)
         for real in REALS.values():
             if feet and real is not DOUBLE:
                 continue
-            out = folder / f"{word}-{real.name}"
+            out = folder / f"{name}-{real.name}"
             out.mkdir(exist_ok=True)
-            export(objective_of(robot, feet), out, prefix=word, real=real, cuda=True, check=False, force=True)
+            export(objective_of(robot, feet), out, prefix=name, real=real, cuda=True, check=False, force=True)
             if real is DOUBLE:
                 write_samples(ImpactGradient.load(out), robot, folder / samples)
-                (out / f"lib{word}.so").unlink()
+                (out / f"lib{name}.so").unlink()
             cases.append({
-                "name": word, "real": real.name, "prefix": word, "header": f"{out.name}/{word}.cuh",
+                "name": name, "real": real.name, "prefix": name, "header": f"{out.name}/{name}.cuh",
                 "samples": samples, "rows": _ROWS // (4 if robot.nv > 20 else 1), "threads": 128, "nq": robot.nq,
                 "nv": robot.nv, "urdf": urdf, "root": robot.spec.model.root, "frax": name in _FRAX and real is DOUBLE,
             })  # fmt: skip
