@@ -16,32 +16,20 @@ from impact_posture.posture.program.constrained_problem import ConstrainedProble
 from impact_posture.posture.search.multistart import solve
 from impact_posture.posture.search.singular_target import singular_target
 from tests.support.settings import make_settings
-
-INERTIAL = (
-    '<inertial><origin xyz="0 0.01 0.07"/><mass value="1"/>'
-    '<inertia ixx="4e-3" iyy="4e-3" izz="2e-3" ixy="0" ixz="0" iyz="0"/></inertial>'
-)
+from tests.support.urdfs import joint, link, write
 
 
-def candle(folder: Path, offset: float = 0.01, **settings: object) -> ConstrainedProblem:
+def candle(folder: Path, offset: float = 0.01, toml: str = "", **settings: object) -> ConstrainedProblem:
     """Return the problem of an arm that is stretched if all seven joints are zero, as many published arms are.
 
     ``offset`` is the distance between its vertical axes, m.
     """
-    links = '<link name="l0"/>' + "".join(f'<link name="l{k}">{INERTIAL}</link>' for k in range(1, 8))
-    joints = "".join(
-        f'<joint name="q{k}" type="revolute"><parent link="l{k - 1}"/><child link="l{k}"/>'
-        f'<origin xyz="{offset * (1 - k % 2)} 0 0.15"/><axis xyz="0 {1 - k % 2} {k % 2}"/>'
-        '<limit lower="-2.5" upper="2.5" effort="100" velocity="5"/></joint>'
-        for k in range(1, 8)
-    )
-    tip = (
-        '<link name="tip"/><joint name="tm" type="fixed"><parent link="l7"/><child link="tip"/>'
-        '<origin xyz="0 0 0.1"/></joint>'
-    )
-    (folder / "candle.urdf").write_text(f'<robot name="candle">{links}{joints}{tip}</robot>')
-    values = {"robot": str(folder / "candle.urdf"), "frame": "tip", "normal": [1.0, 0.0, 0.0], **settings}
-    return prepare(make_settings(values)).problem
+    parts = [link("l0"), link("tip"), joint("tm", "l7 tip", None, "0 0 0.1", "fixed", "")]
+    for k in range(1, 8):
+        axis, at = f"0 {1 - k % 2} {k % 2}", f"{offset * (1 - k % 2)} 0 0.15"
+        parts += [link(f"l{k}", 1, "0 0.01 0.07"), joint(f"q{k}", f"l{k - 1} l{k}", axis, at)]
+    path = write(folder, *parts, toml=toml)
+    return prepare(make_settings({"robot": str(path), "frame": "tip", "normal": [1.0, 0.0, 0.0], **settings})).problem
 
 
 def test_a_stretched_arm_is_named_and_gets_a_bent_start(tmp_path: Path) -> None:
@@ -55,8 +43,8 @@ def test_a_stretched_arm_is_named_and_gets_a_bent_start(tmp_path: Path) -> None:
     table = caught.value.hint.partition("[postures.bent] ")[2].partition(" in robot.toml")[0]
     bent = tomllib.loads(table)["joints"]
     assert 1 <= len(bent) <= 3 and all(abs(abs(angle) - 0.5) < 1e-9 for angle in bent.values())
-    (tmp_path / "robot.toml").write_text(f"[postures.bent]\n{table}\n")
-    assert solve(candle(tmp_path, posture="bent"), starts=4, jobs=1).certified_starts > 0
+    start = candle(tmp_path, toml=f"[postures.bent]\n{table}\n", posture="bent")
+    assert solve(start, starts=4, jobs=1).certified_starts > 0
 
 
 def test_only_singular_targets_are_named(tmp_path: Path) -> None:

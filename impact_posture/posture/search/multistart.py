@@ -282,7 +282,8 @@ def _failure(problem: ConstrainedProblem, runs: list[SolverRun]) -> SolverFailed
     nearest = min((certificate for _, certificate in solved), key=lambda c: c.stationarity)
     fault = f"none of {len(solved)} feasible starts ended at a certified posture"
     hint = "try more `starts`, another `seed` or `posture`, or a small `regularization`"
-    singular = singular_target(problem, [record.q for record, _ in solved])
+    # The starts satisfy the constraints to 1e-8.  The final postures may violate them, and are then less singular.
+    singular = singular_target(problem, [run.start for run in runs if run.start is not None])
     if singular is not None:
         return SolverFailed(f"{fault}: {singular.fact}", where="solver", hint=singular.hint)
     numbers = f"best stationarity {nearest.stationarity:.1e}, violation {nearest.primal:.1e}"

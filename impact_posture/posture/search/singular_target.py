@@ -87,16 +87,14 @@ class _Gains:
 def _bent(problem: ConstrainedProblem, gains: _Gains, rank: int) -> dict[str, float]:
     """Return the fewest joint positions that bend the given posture so that no direction is nearly lost."""
     robot, bent, best = problem.robot, dict[str, float](), problem.given
-    model = robot.model
-    turning = [name for name in robot.joint_names if model.nvs[robot.joint_id(name)] == 1]
+    model, steps = robot.model, np.eye(robot.nv)
+    # The joints with one velocity.
+    turning = {*robot.joint_names} & {*robot.tangent_names} - {*problem.requirements.hold}
     while len(bent) < _MOST_BENT and gains(best)[rank - 1] < _CLEAR:
         trials = []
-        for name, angle in product(turning, (_BEND, -_BEND)):
-            step = np.zeros(model.nv)
-            step[model.idx_vs[robot.joint_id(name)]] = angle
-            q = pin.integrate(model, best, step)
-            inside = (q >= model.lowerPositionLimit).all() and (q <= model.upperPositionLimit).all()
-            if inside and name not in (*bent, *problem.requirements.hold):
+        for name, angle in product(turning - bent.keys(), (_BEND, -_BEND)):
+            q = pin.integrate(model, best, angle * steps[robot.tangent_names.index(name)])
+            if (q >= model.lowerPositionLimit).all() and (q <= model.upperPositionLimit).all():
                 trials.append((float(np.log(gains(q)[:rank] + 1e-9).sum()), name, angle, q))
         if not trials:
             break
