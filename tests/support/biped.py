@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from impact_posture.system.arrays import Array
+from tests.support.urdfs import joint, link
 
 
 def write_hull(path: Path, points: Array) -> None:
@@ -43,20 +44,15 @@ def _leg(side: str, sign: int, foot: str, ankle_roll: bool) -> str:
         links[-2:] = [("foot", "0 0 -0.3", "0 1 0", (-1.0, 1.0), 0.9, foot)]
     parent, text = "hips", ""
     for name, xyz, axis, (low, high), mass, shapes in links:
-        child = f"{side}_{name}"
-        text += (
-            f'<joint name="to_{child}" type="revolute"><parent link="{parent}"/><child link="{child}"/>'
-            f'<origin xyz="{xyz.format(y=0.1 * sign)}"/><axis xyz="{axis}"/>'
-            f'<limit lower="{low}" upper="{high}" effort="100" velocity="5"/></joint>{_link(child, mass, shapes)}'
-        )
+        child, limit = f"{side}_{name}", f'<limit lower="{low}" upper="{high}" effort="100" velocity="5"/>'
+        text += joint(f"to_{child}", f"{parent} {child}", axis, xyz.format(y=0.1 * sign), more=limit)
+        text += _link(child, mass, shapes)
         parent = child
     return text
 
 
 def _link(name: str, mass: float, shapes: str) -> str:
-    moment = 0.01 * mass
-    inertia = f'<inertia ixx="{moment}" iyy="{moment}" izz="{moment}" ixy="0" ixz="0" iyz="0"/>'
-    return f'<link name="{name}"><inertial><mass value="{mass}"/>{inertia}</inertial>{shapes}</link>'
+    return link(name, mass).replace("</link>", f"{shapes}</link>")
 
 
 def _box(size: str, z: float) -> str:
