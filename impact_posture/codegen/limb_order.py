@@ -6,7 +6,6 @@ limbs.  Therefore, few values must be kept at a time if each visit of a limb is 
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 
 import pinocchio as pin
@@ -20,13 +19,10 @@ def limb_of_coordinates(model: pin.Model) -> dict[int, int]:
 
     A limb is a chain of joints without branches, up to its end.
     """
-    parents, limbs = list(model.parents), [0] * model.njoints
-    children = Counter(parents[1:])
-    body = {i for i in range(model.njoints) if children[i] > 1}
-    for i in range(model.njoints - 1, 0, -1):
-        body |= {parents[i]} if i in body else set()
+    body = {j for i in range(model.njoints) if len(model.children[i]) > 1 for j in model.supports[i]}
+    limbs = [0] * model.njoints
     for i in range(1, model.njoints):
-        limbs[i] = 0 if i in body else limbs[parents[i]] or i
+        limbs[i] = 0 if i in body else limbs[model.parents[i]] or i
     return {
         k: limbs[i] for i in range(1, model.njoints) for k in range(model.idx_qs[i], model.idx_qs[i] + model.nqs[i])
     }
