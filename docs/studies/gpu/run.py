@@ -12,7 +12,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -64,18 +64,21 @@ def build_cores(case: Case) -> str:
     return answer if answer.startswith("{") else ""
 
 
+def row(first: list[str], answer: str, cells: Callable[[Case], list[str]]) -> list[str]:
+    """Return the row of an answer of :func:`run`: the first cells, then ``cells`` of the answer, or its error."""
+    data = json.loads(answer)
+    return [*first, *([data["error"]] if "error" in data else cells(data))]
+
+
 def times(cases: list[Case]) -> Iterator[list[str]]:
     """Yield a row for each case."""
     for case in cases:
-        data = json.loads(run([f"./{program(case)}", case["samples"], str(case["rows"])]))
-        if "error" in data:
-            yield [case["name"], case["real"], f"{case['threads']}", data["error"]]
-            continue
-        yield [
-            case["name"], case["real"], f"{case['threads']}", f"{data['threads']}", f"{data['million']:,.0f}",
-            f"{data['best']:,.0f}", f"{data['error_H']:.0e}", f"{data['error_grad']:.0e}", f"{data['registers']}",
-            f"{data['local']}", f"{data['call_us']:.1f}", f"{data['launch_us']:.1f}",
-        ]  # fmt: skip
+        first = [case["name"], case["real"], f"{case['threads']}"]
+        yield row(first, run([f"./{program(case)}", case["samples"], str(case["rows"])]), lambda data: [
+            f"{data['threads']}", f"{data['million']:,.0f}", f"{data['best']:,.0f}", f"{data['error_H']:.0e}",
+            f"{data['error_grad']:.0e}", f"{data['registers']}", f"{data['local']}", f"{data['call_us']:.1f}",
+            f"{data['launch_us']:.1f}",
+        ])  # fmt: skip
 
 
 def table(head: str, rows: Iterator[list[str]]) -> None:
@@ -91,39 +94,32 @@ def cores(cases: list[Case]) -> Iterator[list[str]]:
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         errors = [*pool.map(build_cores, cases)]
     for case, error in zip(cases, errors, strict=True):
-        data = json.loads(error or run([f"./cores-{case['name']}", case["samples"]]))
-        numbers = (
-            [data["error"]]
-            if "error" in data
-            else [str(data["cores"]), f"{data['million']:.1f}", f"{data['error_H']:.0e}"]
-        )
-        yield [case["name"], *numbers]
+        answer = error or run([f"./cores-{case['name']}", case["samples"]])
+        yield row([case["name"]], answer, lambda data: [
+            f"{data['cores']}", f"{data['million']:.1f}", f"{data['error_H']:.0e}",
+        ])  # fmt: skip
 
 
 def frameworks(cases: list[Case]) -> Iterator[list[str]]:
     """Yield the times of calls from PyTorch."""
-    for case in cases:
-        data = json.loads(run([sys.executable, "framework_peer.py", json.dumps(case)]))
-        if "error" in data:
-            yield [case["name"], case["real"], data["error"]]
-            continue
+
+    def cells(data: Case) -> list[str]:
         adam = f"{data['adam_s']:.2f} s, {data['before']:.3g} to {data['after']:.3g}" if "adam_s" in data else "–"
-        yield [case["name"], case["real"], f"{data['nvrtc_s']:.1f}", *[f"{us:.0f}" for us in data["us"]], adam]
+        return [f"{data['nvrtc_s']:.1f}", *[f"{us:.0f}" for us in data["us"]], adam]
+
+    for case in cases:
+        answer = run([sys.executable, "framework_peer.py", json.dumps(case)])
+        yield row([case["name"], case["real"]], answer, cells)
 
 
 def frax(cases: list[Case]) -> Iterator[list[str]]:
     """Yield the evaluations per second of frax."""
     for case in cases:
         for real in ("double", "float"):
-            data = json.loads(
-                run([sys.executable, "frax_peer.py", case["urdf"], case["root"], real, str(case["rows"] // 8)])
-            )
-            row = (
-                [data["error"]]
-                if "error" in data
-                else [f"{data['million']:.2f}", f"{data['compile_s']:.1f}", data["device"]]
-            )
-            yield [case["name"], real, *row]
+            answer = run([sys.executable, "frax_peer.py", case["urdf"], case["root"], real, str(case["rows"] // 8)])
+            yield row([case["name"], real], answer, lambda data: [
+                f"{data['million']:.2f}", f"{data['compile_s']:.1f}", data["device"],
+            ])  # fmt: skip
 
 
 def main() -> int:
