@@ -54,9 +54,8 @@ def touching_by_design(robot: Robot, shapes: Sequence[pin.GeometryObject], pairs
     """
     data, touch = robot.model.createData(), touch_of(shapes)
     jacobians = np.array(pin.computeJointJacobians(robot.model, data, robot.posture()))
-    columns = [range(*v_slice(robot.model, joint).indices(robot.nv)) for joint in range(robot.model.njoints)]
-    supports, joints = [set(line) for line in robot.model.supports], [int(shape.parentJoint) for shape in shapes]
-    sliding = [(i, j) for i, j in pairs if _telescopic(jacobians, columns, supports[joints[i]], supports[joints[j]])]
+    supports = [set(robot.model.supports[shape.parentJoint]) for shape in shapes]
+    sliding = [(i, j) for i, j in pairs if _telescopic(robot.model, jacobians, supports[i], supports[j])]
     nested: set[Pair] = set()
     for q in robot.postures.values() if sliding else ():
         pin.forwardKinematics(robot.model, data, q)
@@ -70,15 +69,14 @@ def touching_by_design(robot: Robot, shapes: Sequence[pin.GeometryObject], pairs
     return [pair for pair in pairs if pair in nested or count.get(pair, 0) > _POSTURES / 2]
 
 
-def _telescopic(jacobians: Array, columns: Sequence[range], first: set[int], second: set[int]) -> bool:
+def _telescopic(model: pin.Model, jacobians: Array, first: set[int], second: set[int]) -> bool:
     """Return whether one joint carries the other, and all joints between them slide along the same direction.
 
-    ``first`` and ``second`` each contain a joint and all joints that carry it.  ``columns`` are the columns of each
-    joint in ``jacobians``, shape (6, nv).
+    ``first`` and ``second`` each contain a joint and all joints that carry it; ``jacobians`` has the shape (6, nv).
     """
     if not (first < second or second < first):
         return False
-    J = jacobians[:, [k for joint in first ^ second for k in columns[joint]]]
+    J = jacobians[:, np.r_[tuple(v_slice(model, joint) for joint in first ^ second)]]
     return not J[3:].any() and np.linalg.matrix_rank(J, _PARALLEL) == 1
 
 

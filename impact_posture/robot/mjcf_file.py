@@ -44,14 +44,12 @@ class MjcfFile(NamedTuple):
 
     Attributes:
         model: The ``mujoco.MjModel`` with the chosen root.
-        root: ``free-flyer`` if the model has a free joint, else ``fixed``.
         keyframes: Name of a keyframe → name of a joint → its entries in ``qpos``.
         couplings: Couplings of joints by equality constraints.
         notes: Warnings about content that has no effect here, one line each.
     """
 
     model: Any
-    root: Root
     keyframes: dict[str, dict[str, Array]]
     couplings: tuple[JointCoupling, ...]
     notes: tuple[str, ...]
@@ -96,8 +94,7 @@ def read_mjcf(path: Path, root: Root | None) -> MjcfFile:
             raise MjcfError(f"MuJoCo refuses it ({error})", where=str(path), hint=hint) from None
     _check_tree(model, path)
     couplings = _couplings(model, path)
-    floating: Root = "free-flyer" if is_floating(model) else "fixed"
-    return MjcfFile(model, floating, keyframes, couplings, (*notes, *_left_out(model)))
+    return MjcfFile(model, keyframes, couplings, (*notes, *_left_out(model)))
 
 
 def object_name(model: Any, kind: str, index: int) -> str:
@@ -206,20 +203,6 @@ def _check_tree(model: Any, path: Path) -> None:
         raise MjcfError(fault, where=str(path), hint=hint)
 
 
-def equated_joints(model: Any) -> list[tuple[int, Array]]:
-    """Return the joints that equality constraints couple, each with the other joint (−1 for none) and polynomial."""
-    joint, equated = import_mujoco().mjtEq.mjEQ_JOINT, list[tuple[int, Array]]()
-    for k in np.flatnonzero(model.eq_active0):
-        if model.eq_type[k] == joint:
-            equated.append((int(model.eq_obj1id[k]), np.r_[model.eq_obj2id[k], model.eq_data[k, :5]]))
-        elif terms := _tendon_terms(model, int(k)):
-            followers = {first for first, _ in equated}
-            first, *rest = sorted(terms, key=lambda j: j in followers)
-            other, ratio = (rest[0], -terms[rest[0]] / terms[first]) if rest else (-1, 0.0)
-            equated.append((first, np.array([other, model.eq_data[k, 0] / terms[first], ratio, 0, 0, 0])))
-    return equated
-
-
 def _tendon_terms(model: Any, k: int) -> dict[int, float]:
     """Return joint → ``c`` for an equality ``Σ c (q − q⁰) = a₀`` of tendons with one or two joints, or nothing."""
     mujoco, terms = import_mujoco(), dict[int, float]()
@@ -237,13 +220,26 @@ def _tendon_terms(model: Any, k: int) -> dict[int, float]:
 
 
 def _couplings(model: Any, path: Path) -> tuple[JointCoupling, ...]:
-    """Return the couplings by equality constraints; raise an error for loops, tendons and polynomials.
+    """Return the couplings by equality constraints; raise an error for loops, polynomials and more than two joints.
 
     The constraint is ``q − q⁰ = a₀ + a₁ (q' − q'⁰) + …`` with the positions ``q⁰``, ``q'⁰`` in ``qpos0``.  A joint
     that a constraint holds at a constant gets equal limits.
     """
-    mujoco, couplings = import_mujoco(), dict[str, JointCoupling]()
-    for first, (second, constant, ratio, *curved) in equated_joints(model):
+    mujoco, couplings, followers = import_mujoco(), dict[str, JointCoupling](), set[int]()
+    for k in map(int, np.flatnonzero(model.eq_active0)):
+        if model.eq_type[k] == mujoco.mjtEq.mjEQ_JOINT:
+            first, second = int(model.eq_obj1id[k]), int(model.eq_obj2id[k])
+            constant, ratio, *curved = model.eq_data[k, :5]
+        elif terms := _tendon_terms(model, k):
+            first, second, *_ = *sorted(terms, key=lambda j: j in followers), -1
+            constant, ratio, curved = model.eq_data[k, 0] / terms[first], -terms.get(second, 0.0) / terms[first], []
+        else:
+            kind = mujoco.mjtEq(int(model.eq_type[k])).name.removeprefix("mjEQ_").lower()
+            what = "couples more than two joints" if kind == "tendon" else "closes a kinematic loop"
+            fault = f"equality '{object_name(model, 'equality', k)}' ({kind}) {what}, which is not supported"
+            hint = "if it hardly matters, remove it in a copy of the file and `lock` the joints that it guides"
+            raise MjcfError(fault, where=str(path), hint=hint)
+        followers.add(first)
         name, start = object_name(model, "joint", first), model.qpos0[model.jnt_qposadr[first]]
         if name in couplings:
             raise MjcfError(f"joint '{name}' follows two joints", where=str(path), hint="remove one")
@@ -253,17 +249,8 @@ def _couplings(model: Any, path: Path) -> tuple[JointCoupling, ...]:
             hint = "make it linear in a copy of the file, or remove it and `lock` the joint"
             raise MjcfError(f"joint '{name}' follows another by a polynomial", where=str(path), hint=hint)
         else:
-            other = int(second)
-            offset = start + constant - ratio * model.qpos0[model.jnt_qposadr[other]]
-            couplings[name] = JointCoupling(name, object_name(model, "joint", other), float(ratio), float(offset))
-    for k in np.flatnonzero(model.eq_active0 & (model.eq_type != mujoco.mjtEq.mjEQ_JOINT)):
-        if _tendon_terms(model, int(k)):
-            continue
-        kind = mujoco.mjtEq(int(model.eq_type[k])).name.removeprefix("mjEQ_").lower()
-        name = object_name(model, "equality", int(k))
-        what = "couples more than two joints" if kind == "tendon" else "closes a kinematic loop"
-        hint = "if it hardly matters, remove it in a copy of the file and `lock` the joints that it guides"
-        raise MjcfError(f"equality '{name}' ({kind}) {what}, which is not supported", where=str(path), hint=hint)
+            offset = start + constant - ratio * model.qpos0[model.jnt_qposadr[second]]
+            couplings[name] = JointCoupling(name, object_name(model, "joint", second), float(ratio), float(offset))
     for name in _coupling_armatures(model):
         hint = "remove its armature in a copy of the file, or move it to the joints"
         raise MjcfError(f"the armature of {name} couples joints", where=str(path), hint=hint)

@@ -7,13 +7,14 @@ is part of its placement.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.robot.mjcf_file import drives_joint, equated_joints, is_floating, object_name
+from impact_posture.robot.joint_coupling import JointCoupling
+from impact_posture.robot.mjcf_file import drives_joint, is_floating, object_name
 from impact_posture.robot.model_joints import q_slice
 from impact_posture.system.arrays import Array
 from impact_posture.system.optional_package import import_mujoco
@@ -23,16 +24,17 @@ ROOT_JOINT = "root_joint"
 _UNIT = 1.01
 
 
-def model_of(mjcf: Any) -> pin.Model:
+def model_of(mjcf: Any, couplings: Sequence[JointCoupling]) -> pin.Model:
     """Return the model of an ``MjModel``: joints, inertias, armature, limits; bodies, joints and sites as frames.
 
     A body with several joints becomes a chain of joints, in which only the last joint carries the inertia.
     """
+    # A coupled joint depends on the whole angle, not only on its cosine and sine.
+    whole = {joint for c in couplings for joint in (c.follower, c.leader)}
     types = import_mujoco().mjtJoint
     model = pin.Model()
     model.name = "robot"
     model.gravity = pin.Motion(np.r_[mjcf.opt.gravity, np.zeros(3)])
-    equated = {j for joint, other in equated_joints(mjcf) for j in (joint, int(other[0]))}
     # Body → joint that moves it, placement in the axes of this joint, frame.
     bodies: list[tuple[int, pin.SE3, int]] = [(0, pin.SE3.Identity(), 0)]
     if mjcf.body_geomnum[0] and not is_floating(mjcf):
@@ -45,8 +47,9 @@ def model_of(mjcf: Any) -> pin.Model:
                 joint = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), ROOT_JOINT)
                 at = pin.SE3.Identity()
             else:
-                kind, before, after = _joint(mjcf, j, j in equated)
-                joint = model.addJoint(joint, kind, at * before, object_name(mjcf, "joint", j))
+                name = object_name(mjcf, "joint", j)
+                kind, before, after = _joint(mjcf, j, endless=name not in whole and not mjcf.jnt_limited[j])
+                joint = model.addJoint(joint, kind, at * before, name)
                 at = after
             frame = model.addJointFrame(joint, frame)
         model.appendBodyToJoint(joint, _inertia(mjcf, b), at)
@@ -78,7 +81,7 @@ def configuration(model: pin.Model, mjcf: Any, entries: Mapping[str, Array] | No
     return np.asarray(pin.normalize(model, q))
 
 
-def _joint(mjcf: Any, j: int, equated: bool) -> tuple[pin.JointModel, pin.SE3, pin.SE3]:
+def _joint(mjcf: Any, j: int, *, endless: bool) -> tuple[pin.JointModel, pin.SE3, pin.SE3]:
     """Return the type of a joint, its placement in its body at ``qpos0``, and the placement of the body after it."""
     types, axis = import_mujoco().mjtJoint, np.array(mjcf.jnt_axis[j])
     shift = pin.SE3(np.eye(3), np.array(mjcf.jnt_pos[j]))
@@ -88,8 +91,7 @@ def _joint(mjcf: Any, j: int, equated: bool) -> tuple[pin.JointModel, pin.SE3, p
     if mjcf.jnt_type[j] == types.mjJNT_SLIDE:
         family, back = "P", pin.SE3(np.eye(3), -reference * axis)
     else:
-        # A coupled joint depends on the whole angle, not only on its cosine and sine.
-        family = "R" if mjcf.jnt_limited[j] or equated else "RUB"
+        family = "RUB" if endless else "R"
         back = pin.SE3(pin.AngleAxis(-reference, axis).matrix(), np.zeros(3))
     if axis.max() == 1.0:
         kind = getattr(pin, f"JointModel{family}{'XYZ'[int(axis.argmax())]}")()

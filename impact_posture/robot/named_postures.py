@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.errors import SpecError, UrdfError
-from impact_posture.robot.model_joints import joint_index, q_slice, scalar_entries
+from impact_posture.robot.model_joints import is_free_flyer, joint_index, q_slice, scalar_entries
 from impact_posture.robot.robot_description import RobotDescription
 from impact_posture.robot.robot_spec import RobotSpec
 from impact_posture.system.arrays import Array
@@ -77,15 +77,15 @@ def _srdf_postures(model: pin.Model, srdf: Path | None, spec: RobotSpec) -> dict
 
 
 def _toml_postures(described: RobotDescription, spec: RobotSpec, name: str) -> dict[str, Array]:
-    model, root, result = described.model, described.root, {}
+    model, floating, result = described.model, is_free_flyer(described.model), {}
     for key, posture in spec.postures.items():
         where = f"{name} posture '{key}'"
         q = _neutral(described)
-        if posture.base is not None and spec.model.root != "free-flyer" and root != "free-flyer":
+        if posture.base is not None and spec.model.root != "free-flyer" and not floating:
             fault = f"posture '{key}' gives a base pose, but the root is fixed"
             raise SpecError(fault, where=name, hint='remove it, or write root = "free-flyer" in [model]')
         # If the user fixes a floating robot to the world, base poses are ignored, and ignored_bases warns.
-        if posture.base is not None and root == "free-flyer":
+        if posture.base is not None and floating:
             norm = float(np.linalg.norm(posture.base[3:]))
             if not (np.isfinite(posture.base).all() and abs(norm - 1) < 1e-3):
                 fault = f"base quaternion of norm {norm:.4g}"

@@ -21,7 +21,6 @@ class RobotDescription(NamedTuple):
 
     Attributes:
         model: Model with all joints.
-        root: Joint between the world and the base.
         neutral: Configuration from which named postures start: zero for a URDF, ``qpos0`` for an MJCF, shape (nq,).
         postures: Name of a keyframe → configuration, shape (nq,).
         couplings: Couplings of joints.
@@ -30,7 +29,6 @@ class RobotDescription(NamedTuple):
     """
 
     model: pin.Model
-    root: Root
     neutral: Array
     postures: Mapping[str, Array]
     couplings: tuple[JointCoupling, ...]
@@ -49,9 +47,9 @@ def read_description(path: Path, root: Root | None, *, accept_inertias: bool = F
     """
     if is_mjcf(path):
         file = read_mjcf(path, root)
-        model = model_of(file.model)
+        model = model_of(file.model, file.couplings)
         postures = {name: configuration(model, file.model, entries) for name, entries in file.keyframes.items()}
         neutral = configuration(model, file.model)
-        return RobotDescription(model, file.root, neutral, postures, file.couplings, file.notes, file.model)
+        return RobotDescription(model, neutral, postures, file.couplings, file.notes, file.model)
     model, warnings, couplings = build_model(path, free_flyer=root == "free-flyer", accept_inertias=accept_inertias)
-    return RobotDescription(model, root or "fixed", pin.neutral(model), {}, present(couplings, model), warnings)
+    return RobotDescription(model, pin.neutral(model), {}, present(couplings, model), warnings)

@@ -14,7 +14,7 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.config.checked import checked
-from impact_posture.config.problem_settings import LoadOptions, RobotSettings, Vector3
+from impact_posture.config.problem_settings import LoadOptions, RobotSettings, Root, Vector3
 from impact_posture.config.table_validation import validate
 from impact_posture.errors import (
     InputError,
@@ -28,7 +28,14 @@ from impact_posture.errors import (
 from impact_posture.robot.armature import armature_warning, set_armature
 from impact_posture.robot.inertia_checks import check_any_mass, check_mass_matrix, check_moved_mass, massless_joints
 from impact_posture.robot.joint_coupling import couple_limits, coupled, present, with_partners
-from impact_posture.robot.model_joints import immovable_joints, joint_index, movable_joints, q_slice, v_slice
+from impact_posture.robot.model_joints import (
+    immovable_joints,
+    is_free_flyer,
+    joint_index,
+    movable_joints,
+    q_slice,
+    v_slice,
+)
 from impact_posture.robot.named_postures import ignored_bases, named_postures
 from impact_posture.robot.robot import CompiledMjcf, Robot, RobotFiles
 from impact_posture.robot.robot_collections import COLLECTIONS, CollectedRobot, collected, names_with
@@ -70,7 +77,8 @@ def build_robot(located: Located, options: LoadOptions) -> Robot:
     _check_package_dirs(options.package_dir, Path(), "package_dir")
     _check_package_dirs(spec.model.package_dirs, base, f"{name} robot.toml [model] package_dirs")
     described = read_description(urdf, options.root or spec.model.root, accept_inertias=spec.model.accept_inertias)
-    model, root, warnings = described.model, described.root, described.warnings
+    model, warnings = described.model, described.warnings
+    root: Root = "free-flyer" if is_free_flyer(model) else "fixed"
     _check_names(model, source)
     _remount(model, options.mounting, name)
     srdf = _srdf_path(spec, options, base)
