@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from impact_posture.errors import JointLocked, JointNotFound, PostureError, PostureNotFound, nearest, shown
+from impact_posture.robot.joint_coupling import coupled
 from impact_posture.robot.model_joints import q_slice, scalar_entries, scalar_value
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
@@ -211,12 +212,7 @@ def set_joints(robot: Robot, q: Array, joints: Mapping[str, object], where: str)
                 fault = f"joint '{name}' takes {nq} numbers, not {len(numbers)}"
                 raise PostureError(fault, where=where, hint="correct it")
             q[entries] = numbers
-    exact = robot.coupled(q)
-    for c in robot.couplings:
-        if c.follower not in joints:
-            entries = q_slice(robot.model, robot.joint_id(c.follower))
-            q[entries] = exact[entries]
-    return q
+    return coupled(robot.model, [c for c in robot.couplings if c.follower not in joints], q)
 
 
 def _names(value: object, key: str, where: str) -> list[str]:

@@ -122,19 +122,18 @@ def _actuation(robot: Robot, propulsion: PropulsionSpec) -> dict[str, Any]:
     for name in robot.postures:
         q = robot.posture(name)
         held = hover(model, propulsion, q)
-        entry: dict[str, Any] = {
-            "posture": name,
-            "feasible": held.feasible,
-            "thrusts": held.thrusts,
-            "thrust_margin": held.thrust_margin,
-            "torque_margin": held.torque_margin,
-            "violations": held.violations,
-            "lateral_force": None,
-        }
-        if pin.Quaternion(np.array(q[3:7])).toRotationMatrix()[2, 2] > 1 - 1e-6:
-            lateral = lateral_force_range(model, propulsion, q)
-            entry["lateral_force"] = lateral
-        postures.append(entry)
+        level = pin.Quaternion(np.array(q[3:7])).toRotationMatrix()[2, 2] > 1 - 1e-6
+        postures.append(
+            {
+                "posture": name,
+                "feasible": held.feasible,
+                "thrusts": held.thrusts,
+                "thrust_margin": held.thrust_margin,
+                "torque_margin": held.torque_margin,
+                "violations": held.violations,
+                "lateral_force": lateral_force_range(model, propulsion, q) if level else None,
+            }
+        )
     return {
         "rotors": len(propulsion.rotors),
         "frame": propulsion.frame,
