@@ -30,10 +30,6 @@ class JointCoupling:
     ratio: float
     offset: float
 
-    def of(self, model: pin.Model, q: Array) -> float:
-        """Return the position of the follower for the position of the leader in ``q``, shape (nq,)."""
-        return self.ratio * float(q[_in_q(model, self.leader)]) + self.offset
-
 
 def composed(stated: Mapping[str, JointCoupling], where: str) -> tuple[JointCoupling, ...]:
     """Return couplings in which no leader is a follower, for couplings by the name of the follower.
@@ -157,25 +153,15 @@ def couple_limits(model: pin.Model, couplings: Iterable[JointCoupling]) -> list[
 
 
 def coupled_entries(model: pin.Model, couplings: Iterable[JointCoupling]) -> list[tuple[int, int, float]]:
-    """Return (entry of the follower in ν, entry of the leader, ratio) of each coupling whose joints can move."""
-    entries = [(_in_v(model, c.follower), _in_v(model, c.leader), c.ratio) for c in couplings]
-    return [entry for entry in entries if np.isfinite(model.armature[entry[0]])]
-
-
-def coupling_matrix(model: pin.Model, couplings: Iterable[JointCoupling]) -> Array:
-    """Return the projector ``C``, shape (nv, nv)."""
-    C = np.eye(model.nv)
-    for c in couplings:
-        follower = _in_v(model, c.follower)
-        C[follower, follower], C[follower, _in_v(model, c.leader)] = 0.0, c.ratio
-    return C
+    """Return (entry of the follower in ν, entry of the leader, ratio) of each coupling."""
+    return [(_in_v(model, c.follower), _in_v(model, c.leader), c.ratio) for c in couplings]
 
 
 def coupled(model: pin.Model, couplings: Sequence[JointCoupling], q: Array) -> Array:
     """Return a copy of ``q``, shape (nq,), with each follower at the position that its leader requires."""
     q = np.array(q, dtype=float)
     for c in couplings:
-        q[_in_q(model, c.follower)] = c.of(model, q)
+        q[_in_q(model, c.follower)] = c.ratio * q[_in_q(model, c.leader)] + c.offset
     return q
 
 

@@ -27,8 +27,9 @@ def named_postures(
         UrdfError: The SRDF cannot be read.
         SpecError: A posture of ``robot.toml`` does not fit the model, or the default posture does not exist.
     """
-    model, known = described.model, {key: q for key, q in described.postures.items() if key not in spec.postures}
-    postures = known | _srdf_postures(model, srdf, spec) | _toml_postures(described, spec, name)
+    states = {**described.postures, **_srdf_postures(described.model, srdf)}
+    kept = {key: q for key, q in states.items() if key not in spec.postures}
+    postures = kept | _toml_postures(described, spec, name)
     default = spec.default_posture or next(iter(postures), "neutral")
     postures.setdefault("neutral", _neutral(described))
     if default not in postures:
@@ -65,15 +66,15 @@ def _neutral(described: RobotDescription) -> Array:
     return np.asarray(np.clip(described.neutral, model.lowerPositionLimit, model.upperPositionLimit))
 
 
-def _srdf_postures(model: pin.Model, srdf: Path | None, spec: RobotSpec) -> dict[str, Array]:
+def _srdf_postures(model: pin.Model, srdf: Path | None) -> dict[str, Array]:
     if srdf is None:
         return {}
     try:
         pin.loadReferenceConfigurations(model, str(srdf), False)
     except Exception as error:  # The XML library of Pinocchio may raise any exception.
         raise UrdfError(f"is not an SRDF ({error})", where=str(srdf), hint="correct the SRDF") from None
-    states = {item.key(): np.array(item.data(), dtype=float) for item in model.referenceConfigurations}
-    return {name: pin.normalize(model, q) for name, q in states.items() if name not in spec.postures}
+    states = model.referenceConfigurations
+    return {item.key(): pin.normalize(model, np.array(item.data(), dtype=float)) for item in states}
 
 
 def _toml_postures(described: RobotDescription, spec: RobotSpec, name: str) -> dict[str, Array]:

@@ -22,13 +22,7 @@ from impact_posture.errors import (
     PostureError,
     PostureNotFound,
 )
-from impact_posture.robot.joint_coupling import (
-    JointCoupling,
-    coupled,
-    coupled_entries,
-    coupling_matrix,
-    with_partners,
-)
+from impact_posture.robot.joint_coupling import JointCoupling, coupled, coupled_entries, with_partners
 from impact_posture.robot.model_hash import dynamics_hash, hash_of, kinematics_hash, rounded
 from impact_posture.robot.model_joints import (
     ENDLESS,
@@ -188,12 +182,16 @@ class Robot:
     @cached_property
     def coupling_matrix(self) -> Array:
         """Projector ``C`` onto the velocities that the couplings of joints allow, ``ν = C ν``, shape (nv, nv)."""
-        return coupling_matrix(self.model, self.couplings)
+        C = np.eye(self.nv)
+        for follower, leader, ratio in coupled_entries(self.model, self.couplings):
+            C[follower, follower], C[follower, leader] = 0.0, ratio
+        return C
 
     @cached_property
     def coupled_entries(self) -> list[tuple[int, int, float]]:
         """Entry of the follower in ν, entry of the leader, and ratio, for each coupling of joints that can move."""
-        return coupled_entries(self.model, self.couplings)
+        entries = coupled_entries(self.model, self.couplings)
+        return [entry for entry in entries if np.isfinite(self.model.armature[entry[0]])]
 
     @cached_property
     def coupled_joints(self) -> frozenset[str]:
