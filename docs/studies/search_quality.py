@@ -11,6 +11,7 @@ import json
 import statistics
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -107,8 +108,8 @@ def _runs(case: _Case, request: Request, known: _Known) -> Iterator[Run]:
     name, groups, problem = case
     known.start(name, lambda: solve(problem, starts=_MANY, seed=_OTHER_SEED, jobs=request.jobs, compile="never"))
     for seed in range(request.seed, request.seed + request.count):
-        plain, plain_time = _timed(lambda seed=seed: solve(problem, seed=seed, jobs=1))  # type: ignore[misc]
-        better, took = _timed(lambda seed=seed: solve(problem, seed=seed, jobs=1, screened=SCREENED))  # type: ignore[misc]
+        plain, plain_time = _timed(partial(solve, problem, seed=seed, jobs=1))
+        better, took = _timed(partial(solve, problem, seed=seed, jobs=1, screened=SCREENED))
         known.lower(name, plain, better)
         say(f"{name}, seed {seed}: {better:.6g} in {took:.2f} s, {STARTS} starts {plain:.6g} in {plain_time:.2f} s")
         yield Run(name, groups, seed, better, took, plain, plain_time)

@@ -59,17 +59,21 @@ def at_front(robot: Robot, contact: ImpactContact, q: Array, held: Sequence[str]
     return replace(contact, offset=front.offset)
 
 
+def early_touches(
+    robot: Robot, contacts: Sequence[ImpactContact], q: Array, held: Sequence[str] = ()
+) -> tuple[EarlyTouch, ...]:
+    """Return the links that reach more than :data:`BEYOND` beyond a contact point at ``q``, shape (nq,)."""
+    fronts = [(contact, front_of(robot, contact, q, held)) for contact in contacts]
+    return tuple(EarlyTouch(c, front) for c, front in fronts if front is not None and front.reach > BEYOND)
+
+
 def sunken_feet(robot: Robot, supports: Sequence[Support], q: Array) -> list[str]:
     """Return a warning for each foot that reaches more than :data:`BEYOND` below its contact point at ``q``."""
     warnings = []
-    for foot in supports:
-        down = ImpactContact(foot.frame, (0.0, 0.0, 1.0), offset=foot.offset)
-        front = front_of(robot, down, q)
-        if front is not None and front.reach > BEYOND:
-            touch = EarlyTouch(down, front)
-            below = (
-                f"{1e3 * front.reach:.0f} mm below the contact point of the foot {foot.frame}, so it is in the ground"
-            )
-            hint = f"give robot.toml [[supports]] offset = [{touch.offset.replace(' ', ', ')}]"
-            warnings.append(f"{front.link} reaches {below}: {hint}")
+    for touch in early_touches(
+        robot, [ImpactContact(s.frame, (0.0, 0.0, 1.0), offset=s.offset) for s in supports], q
+    ):
+        below = f"{1e3 * touch.front.reach:.0f} mm below the contact point of the foot {touch.contact.frame}"
+        hint = f"give robot.toml [[supports]] offset = [{touch.offset.replace(' ', ', ')}]"
+        warnings.append(f"{touch.front.link} reaches {below}, so it is in the ground: {hint}")
     return warnings

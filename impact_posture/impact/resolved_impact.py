@@ -10,7 +10,7 @@ from impact_posture.config.problem_settings import ImpactSettings, ObjectiveKind
 from impact_posture.config.setting import stated as is_stated
 from impact_posture.config.text_parsers import parse_contact
 from impact_posture.errors import ContactError, FrameNotFound
-from impact_posture.impact.contact_point import BEYOND, EarlyTouch, at_front, front_of, sunken_feet
+from impact_posture.impact.contact_point import EarlyTouch, at_front, early_touches, sunken_feet
 from impact_posture.impact.elasticity.contact_compression import ContactStiffness
 from impact_posture.impact.evaluation.evaluation import Evaluation, evaluate
 from impact_posture.impact.impact_contact import ImpactContact, point_on
@@ -203,9 +203,8 @@ class ResolvedImpact:
         return (*warnings, f"{self.robot.name} is assumed to be floating freely, {FLOATS}; {self.missing_support}")
 
     def early_touches(self, q: Array) -> tuple[EarlyTouch, ...]:
-        """Return the links that reach more than :data:`BEYOND` beyond a contact point at ``q``, shape (nq,)."""
-        fronts = [(contact, front_of(self.robot, contact, q, self.held)) for contact in self.objective.contacts]
-        return tuple(EarlyTouch(c, front) for c, front in fronts if front is not None and front.reach > BEYOND)
+        """Return the links that touch a surface before the contact point at ``q``, shape (nq,)."""
+        return early_touches(self.robot, self.objective.contacts, q, self.held)
 
     def to_dict(self, q: Array | None = None) -> dict[str, object]:
         """Return the blocks of ``result.json`` that describe the impact: robot, contacts, supports, metric.

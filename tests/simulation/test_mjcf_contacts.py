@@ -13,6 +13,7 @@ import pytest
 from impact_posture.collision.mjcf_shapes import solid_geoms
 from impact_posture.dynamics.mjcf import Mjcf
 from impact_posture.dynamics.mjcf_layout import file_layout
+from impact_posture.robot.model_joints import q_slice
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.simulation.outcome import doubts
@@ -101,7 +102,7 @@ def test_contacts_between_links_are_those_of_the_file(tmp_path: Path, name: str,
     built = build_scene(robot, Scene(), robot.posture())
     model, layout, theirs = built.mjcf.compile(), built.mjcf.layout, file_layout(robot.mjcf.joints)
     moving = [robot.mjcf.joints.getJointId(joint) for joint in robot.model.names[1:]]
-    places = np.concatenate([np.arange(robot.mjcf.joints.nq)[_slice(robot.mjcf.joints, j)] for j in moving])
+    places = np.r_[tuple(q_slice(robot.mjcf.joints, joint) for joint in moving)]
     links = {model.geom(geom).id: link.body for geom, link in built.link_geoms.items()}
     bodies = {g: source.body(b).name or f"body{b}" for b, solid in solid_geoms(source) for g in solid}
     assert sorted(links.values()) == sorted(bodies.values())
@@ -119,10 +120,6 @@ def test_contacts_between_links_are_those_of_the_file(tmp_path: Path, name: str,
         for mine, of_file in zip(actual, expected, strict=True):
             assert np.allclose(mine[3:], of_file[3:], rtol=0, atol=1e-3 if name == "wedges" else 1e-9)
     assert count > 3
-
-
-def _slice(model: pin.Model, joint: int) -> slice:
-    return slice(model.idx_qs[joint], model.idx_qs[joint] + model.nqs[joint])
 
 
 @pytest.mark.parametrize("name", SETS)
