@@ -25,6 +25,7 @@ from tests.support.arms import Z, arm
 from tests.support.command import refused, run
 from tests.support.helpers import robot
 from tests.support.settings import make_settings
+from tests.support.urdfs import joint, link, write
 
 FAST = ("--starts", "2", "--jobs", "1", "--no-codegen", "--format", "png")
 BLOCK = set(
@@ -187,22 +188,14 @@ def crank(folder: Path) -> Path:
 
     The start has one sign of the elbow, the optimum the other.  No motion that holds the tip joins them.
     """
-    parts, parent, at = ['<robot name="crank"><link name="base"/>'], "base", 0.0
-    for k, rod in enumerate((0.1, 0.4, 0.4)):
-        parts.append(
-            f'<joint name="joint_{k}" type="revolute"><parent link="{parent}"/><child link="link_{k}"/>'
-            f'<origin xyz="{at} 0 0"/><axis xyz="0 0 1"/><limit lower="-3.1" upper="3.1" effort="5" velocity="9"/>'
-            f'</joint><link name="link_{k}"><inertial><origin xyz="{rod / 2} 0 0"/><mass value="0.2"/>'
-            '<inertia ixx="1e-3" iyy="1e-3" izz="1e-3" ixy="0" ixz="0" iyz="0"/></inertial></link>'
-        )
-        parent, at = f"link_{k}", rod
-    tip = f'<origin xyz="{at} 0 0"/></joint><link name="tip"/></robot>'
-    parts.append(f'<joint name="tool" type="fixed"><parent link="{parent}"/><child link="tip"/>{tip}')
-    (folder / "crank.urdf").write_text("".join(parts), encoding="utf-8")
+    limit, ends = '<limit lower="-3.1" upper="3.1" effort="5" velocity="9"/>', (0.0, 0.1, 0.4, 0.4)
+    parts = [link("link_0"), link("tip"), joint("tool", "link_3 tip", None, f"{ends[3]} 0 0", "fixed", "")]
+    for k in range(3):
+        place = f"link_{k} link_{k + 1}", "0 0 1", f"{ends[k]} 0 0"
+        parts += [link(f"link_{k + 1}", 0.2, f"{ends[k + 1] / 2} 0 0"), joint(f"joint_{k}", *place, more=limit)]
     joints = ", ".join(f"joint_{k} = {value}" for k, value in enumerate(assembled(0.3, 1.0)))
     postures = f'default_posture = "up"\n[postures.up]\njoints = {{ {joints} }}\n'
-    (folder / "robot.toml").write_text(f'{postures}[contact]\nframe = "tip"\n', encoding="utf-8")
-    return folder / "crank.urdf"
+    return write(folder, *parts, toml=f'{postures}[contact]\nframe = "tip"\n')
 
 
 def test_without_a_path_to_the_optimum_the_answer_is_the_posture_where_the_path_ends(tmp_path: Path) -> None:

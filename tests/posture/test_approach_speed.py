@@ -25,6 +25,7 @@ from tests.support.command import refused, run
 from tests.support.constraints import check_lifted_rows
 from tests.support.helpers import Vector, rng
 from tests.support.settings import make_settings
+from tests.support.urdfs import MOVED, joint, link, write
 
 # Problems with fixed and standing bases, one and two contacts, a normal in the contact frame, a held joint and a kept
 # frame.
@@ -95,8 +96,8 @@ def fastest(posed: Prepared, q: Vector) -> float:
     limit = np.where(model.velocityLimit > 0, model.velocityLimit, np.inf)
     if robot.floating:
         limit[:6] = 0.0
-    for joint in wanted.hold:
-        limit[model.idx_vs[model.getJointId(joint)]] = 0.0
+    for name in wanted.hold:
+        limit[model.idx_vs[model.getJointId(name)]] = 0.0
     A = np.column_stack([np.array(rows), arrives])
     bounds = [*((-v, v) if np.isfinite(v) else (None, None) for v in limit), (0, 1e3)]
     optimum = linprog(np.append(np.zeros(nv), -1.0), A_eq=A, b_eq=np.zeros(len(A)), bounds=bounds)
@@ -192,25 +193,14 @@ def test_a_kept_foot_does_not_count_as_a_leg_that_moves_the_hand() -> None:
     )
 
 
-def chain(path: Path, axes: str, limits: Sequence[float]) -> str:
+def chain(folder: Path, axes: str, limits: Sequence[float]) -> str:
     """Write an arm of links along z; a velocity limit of zero stands for an unlimited joint."""
-    turns = {"x": "1 0 0", "y": "0 1 0", "z": "0 0 1"}
-    parts = ['<robot name="chain"><link name="ground"/>']
+    turns, last = {"x": "1 0 0", "y": "0 1 0", "z": "0 0 1"}, len(axes)
+    parts = [link("l0"), link("tip"), joint("end", f"l{last} tip", None, "0 0 0.3", "fixed", "")]
     for k, (axis, limit) in enumerate(zip(axes, limits, strict=True)):
-        parent = f"l{k - 1}" if k else "ground"
-        parts.append(
-            f'<link name="l{k}"><inertial><origin xyz="0 0 0.15"/><mass value="2"/>'
-            '<inertia ixx="0.02" ixy="0" ixz="0" iyy="0.02" iyz="0" izz="0.01"/></inertial></link>'
-            f'<joint name="j{k}" type="revolute"><parent link="{parent}"/><child link="l{k}"/>'
-            f'<origin xyz="0 0 {0.3 if k else 0}"/><axis xyz="{turns[axis]}"/>'
-            f'<limit lower="-2.5" upper="2.5" effort="200" velocity="{limit}"/></joint>'
-        )
-    parts.append(
-        f'<link name="tip"/><joint name="end" type="fixed"><parent link="l{len(axes) - 1}"/><child link="tip"/>'
-        '<origin xyz="0 0 0.3"/></joint></robot>'
-    )
-    path.write_text("".join(parts))
-    return str(path)
+        moved, at = MOVED.replace('velocity="5"', f'velocity="{limit}"'), f"0 0 {0.3 if k else 0}"
+        parts += [link(f"l{k + 1}", 2, "0 0 0.15"), joint(f"j{k}", f"l{k} l{k + 1}", turns[axis], at, more=moved)]
+    return str(write(folder, *parts))
 
 
 @pytest.mark.parametrize(
@@ -228,7 +218,7 @@ def chain(path: Path, axes: str, limits: Sequence[float]) -> str:
     ],
 )
 def test_unusual_arms_certify(tmp_path: Path, axes: str, limits: list[float], pose: str) -> None:
-    path = chain(tmp_path / "chain.urdf", axes, limits)
+    path = chain(tmp_path, axes, limits)
     q = tuple([0.3, 0.6, 0.5, 0.4, 0.3, 0.4, 0.2][: len(axes)])
     values = {"robot": path, "frame": "tip", "normal": (-1, 0, 0), "q": q, "contact_pose": pose}
     posed = prepare(make_settings({**values, "speed": 0.2, "approach": True}))

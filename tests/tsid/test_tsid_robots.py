@@ -33,6 +33,7 @@ from impact_posture.tsid.tasks.impact_robust import Gradient, ImpactRobustPostur
 from impact_posture.tsid.tasks.joint_posture import JointPosture
 from tests.support.helpers import NAMES, rng, robot
 from tests.support.step_bounds import step_bound
+from tests.support.urdfs import joint, link, write
 from tests.tsid.test_tsid_controller import DT, assert_dynamics, assert_limits, integrate, run
 from tests.tsid.test_tsid_never_fails import ANSWERED, PROGRAMS, bracing, program_of, well
 
@@ -82,23 +83,17 @@ def test_every_robot_under_every_formulation(name: str) -> None:
         assert_flies(r, formulations(r, robust)[k], 60)
 
 
-OWN = """<robot name="own">
-<link name="a">{mass}</link><link name="b">{mass}</link><link name="c">{mass}</link><link name="d">{mass}</link>
-<joint name="turns" type="continuous"><parent link="a"/><child link="b"/><axis xyz="1 2 3"/></joint>
-<joint name="stuck" type="prismatic"><parent link="b"/><child link="c"/><origin xyz="0 0 0.4"/><axis xyz="1 0 0"/>
-<limit lower="0" upper="0" effort="10" velocity="1"/></joint>
-<joint name="bends" type="revolute"><parent link="c"/><child link="d"/><origin xyz="0 0 0.4"/><axis xyz="0 1 0"/>
-<limit lower="-1" upper="1" effort="0" velocity="0"/></joint></robot>""".format(
-    mass='<inertial><origin xyz="0 0 0.2"/><mass value="1"/>'
-    '<inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial>'
-)
+OWN = (
+    *(link(name, 1, "0 0 0.2") for name in "abcd"), joint("turns", "a b", "1 2 3", kind="continuous", more=""),
+    joint("stuck", "b c", "1 0 0", "0 0 0.4", "prismatic", '<limit lower="0" upper="0" effort="10" velocity="1"/>'),
+    joint("bends", "c d", "0 1 0", "0 0 0.4", more='<limit lower="-1" upper="1" effort="0" velocity="0"/>'),
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("root", ["fixed", "free-flyer"])
 def test_an_unknown_urdf_is_controlled(root: str, tmp_path: Path) -> None:
     """The robot has a continuous joint about an oblique axis, a joint with equal limits, and an unlimited joint."""
-    (tmp_path / "own.urdf").write_text(OWN)
-    r = load_robot(str(tmp_path / "own.urdf"), LoadOptions(root=root))  # type: ignore[arg-type]
+    r = load_robot(str(write(tmp_path, *OWN)), LoadOptions(root=root))  # type: ignore[arg-type]
     # For a falling robot with an unlimited motor, a strict task would demand unlimited torque.
     for level in (((FramePosition(Point("d")),),), ()) if root == "fixed" else ((),):
         posture = ImpactRobustPosture(r, well(r), K=20.0, kp=20.0)

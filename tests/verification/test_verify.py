@@ -42,6 +42,7 @@ from impact_posture.verification.verification import (
 from tests.dynamics.test_dynamics import write_urdf
 from tests.support.command import run
 from tests.support.helpers import NAMES, Vector, robot
+from tests.support.urdfs import joint, link, write
 
 QUANTITIES = ["H", "G", "Λ_c", "∇H"]
 HAS_MUJOCO = importlib.util.find_spec("mujoco") is not None
@@ -109,16 +110,10 @@ def test_a_contact_with_one_direction_of_motion_passes(tmp_path: Path) -> None:
 @pytest.mark.parametrize("joints", [1, 3])
 def test_an_impact_across_the_plane_of_a_planar_robot_passes(tmp_path: Path, joints: int) -> None:
     """G and H are exactly zero, so V is undefined.  All compared quantities are defined."""
-    link = '<link name="{}"><inertial><mass value="1"/><inertia {}/></inertial></link>'
-    inertia = " ".join(f'{key}="{0.01 * (key[1] == key[2])}"' for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"))
-    joint = (
-        '<joint name="j{0}" type="continuous"><parent link="l{0}"/><child link="l{1}"/><axis xyz="0 0 1"/>{2}</joint>'
-    )
-    text = "".join(link.format(f"l{k}", inertia) for k in range(joints + 1))
-    text += "".join(joint.format(k, k + 1, '<origin xyz="0.5 0 0"/>') for k in range(joints))
-    (tmp_path / "planar.urdf").write_text(f'<robot name="planar">{text}</robot>')
+    parts = [link(f"l{k}", 1) for k in range(joints + 1)]
+    parts += [joint(f"j{k}", f"l{k} l{k + 1}", "0 0 1", "0.5 0 0", "continuous", "") for k in range(joints)]
     options = {"frame": f"l{joints}", "normal": (0, 0, 1), "offset": (0.5, 0, 0)}
-    planar = resolve(ImpactSettings(robot=str(tmp_path / "planar.urdf"), **options)).objective
+    planar = resolve(ImpactSettings(robot=str(write(tmp_path, *parts)), **options)).objective
     report = verify(planar, samples=1)
     assert planar.oracle.quantities(report.samples[0].q).G == 0.0
     assert_all_there(report)
