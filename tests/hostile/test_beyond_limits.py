@@ -28,25 +28,16 @@ from impact_posture.robot.robot_spec import read_spec
 from impact_posture.robot.urdf import MOST_DEGREES_OF_FREEDOM, build_model
 from impact_posture.system.toolchain import find_compiler, words_of
 from impact_posture_cli.error_boundary import run
-
-LINK = (
-    '<link name="l{0}"><inertial><mass value="1"/>'
-    '<inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>'
-)
-JOINT = '<joint name="j{0}" type="continuous"><parent link="l{0}"/><child link="l{1}"/><axis xyz="0 0 1"/></joint>'
-
-
-def chain(path: Path, joints: int) -> Path:
-    text = "".join(LINK.format(k) for k in range(joints + 1)) + "".join(JOINT.format(k, k + 1) for k in range(joints))
-    path.write_text(f'<robot name="chain">{text}</robot>')
-    return path
+from tests.support.urdfs import joint, link, write
 
 
 @pytest.mark.parametrize("root", ["fixed", "free-flyer"])
 @pytest.mark.parametrize("joints", [MOST_DEGREES_OF_FREEDOM + 1, 1000])
 def test_too_many_joints_are_refused_before_anything_is_allocated(tmp_path: Path, joints: int, root: str) -> None:
+    parts = [link(f"l{k}", 1) for k in range(joints + 1)]
+    parts += [joint(f"j{k}", f"l{k} l{k + 1}", "0 0 1", kind="continuous", more="") for k in range(joints)]
     with pytest.raises(UrdfError, match=f"more than the supported {MOST_DEGREES_OF_FREEDOM}"):
-        build_model(chain(tmp_path / "chain.urdf", joints), free_flyer=root == "free-flyer")
+        build_model(write(tmp_path, *parts), free_flyer=root == "free-flyer")
 
 
 @pytest.mark.parametrize("impulse", [1e308, 1e200, 1e-200, 5e-324])
