@@ -16,6 +16,7 @@ from impact_posture.config.problem_settings import LoadOptions, Root
 from impact_posture.draft.toml_lines import Draft, comment_lines
 from impact_posture.errors import InertiaError, InputError, MjcfError, OutputError, UrdfError
 from impact_posture.robot import guessed_parts as guess
+from impact_posture.robot.model_joints import joint_family
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_collections import COLLECTIONS
 from impact_posture.robot.robot_loader import Located, build_robot, known_robots, load_robot, locate
@@ -269,7 +270,7 @@ def _limits(draft: Draft, robot: Robot) -> None:
     for joint in robot.joint_names:
         index = robot.joint_id(joint)
         k = int(model.idx_qs[index])
-        turns = model.nqs[index] == 1 and "JointModelR" in model.joints[index].shortname()
+        turns = joint_family(model.joints[index]) == "revolute"
         if turns and model.upperPositionLimit[k] - model.lowerPositionLimit[k] > 4 * np.pi + 1e-3:
             wide.append(joint)
     if wide:

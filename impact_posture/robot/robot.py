@@ -401,8 +401,8 @@ def unit_parts(model: pin.Model) -> list[tuple[int, slice]]:
     """Return (joint index, entries in ``q``) of every quaternion and every pair of cosine and sine in ``q``."""
     parts = []
     for joint in range(1, model.njoints):
-        freedom, end = int(model.nvs[joint]), q_slice(model, joint).stop
-        if model.nqs[joint] != freedom:
-            count = 4 if freedom in (3, 6) and "Planar" not in model.joints[joint].shortname() else 2
+        if model.nqs[joint] != model.nvs[joint]:
+            end = q_slice(model, joint).stop
+            count = 4 if joint_family(model.joints[joint]) in ("spherical", "free-flyer") else 2
             parts.append((joint, slice(end - count, end)))
     return parts

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-import os
 import sys
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,6 +19,7 @@ from urllib.parse import quote
 from impact_posture.errors import InputError, PackageNotFound, UrdfError, nearest
 from impact_posture.system.libraries import cache_folder
 from impact_posture.system.optional_package import import_extra
+from impact_posture.system.output_folder import write_whole
 
 # Module of ROS from which xacro gets the folder of a package.
 _INDEX = "ament_index_python.packages"
@@ -112,9 +112,7 @@ def expand_xacro(
     name = path.name.removesuffix(".xacro").removesuffix(".urdf") + ".urdf"
     urdf = cache_folder("xacro", hashlib.sha256(content).hexdigest()[:16]) / name
     if not urdf.is_file():
-        beside = urdf.with_name(f"{name}-{os.getpid()}")
-        beside.write_bytes(content)
-        os.replace(beside, urdf)
+        write_whole(urdf, content)
     return urdf
 
 
