@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from docs.studies.core import Request, machine, table
-from impact_posture.collision.mesh_check import mesh_collisions
+from impact_posture.collision.mesh_check import MeshCheck
 from impact_posture.collision.robot_shapes import RobotShapes, fit_shapes, load_shapes
 from impact_posture.collision.swept_hull import separation
 from impact_posture.collision.urdf_shapes import read_urdf_shapes
@@ -51,7 +51,7 @@ def _row(name: str) -> list[str]:
         str(len(shapes.geometry.collisionPairs)),
         str(len(shapes.pairs)),
         f"{seconds:.1f}",
-        f"{len(mesh_collisions(robot, shapes, robot.posture()))}, {sum(_overlap(robot, shapes))}",
+        f"{len(MeshCheck(robot, shapes).collisions(robot.posture()))}, {sum(_overlap(robot, shapes))}",
         _named(shapes.always_touching),
         f"{len(shapes.joint_planes)}, {rows}, {len(shapes.hulls_touching)}",
     ]

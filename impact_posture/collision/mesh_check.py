@@ -99,13 +99,6 @@ class MeshCheck:
         return np.asarray((away <= self._reach) & allowed)[:, None]
 
 
-def mesh_collisions(
-    robot: Robot, shapes: RobotShapes, q: Array, obstacles: Sequence[Standing] = (), planes: Sequence[HalfSpace] = ()
-) -> list[tuple[str, str]]:
-    """Return the collisions at one posture; see :meth:`MeshCheck.collisions`."""
-    return MeshCheck(robot, shapes).collisions(q, obstacles, planes)
-
-
 def _deep(a: Any, at_a: pin.SE3, b: Any, at_b: pin.SE3) -> bool:
     """Return whether two shapes still collide after a separation by the tolerance."""
     request, result = coal.CollisionRequest(), coal.CollisionResult()

@@ -52,7 +52,7 @@ class MjcfShape(LinkShape):
         return Corrected(triangle_mesh(*(hull_surface(self.surface[0]) if self.hull else self.surface)), True)
 
 
-def mjcf_shapes(model: Any, first: str = "collision") -> LinkShapes:
+def mjcf_shapes(model: Any, first: str) -> LinkShapes:
     """Return the solid geoms of an ``MjModel``; with ``first="visual"``, the visual geoms of bodies that have any.
 
     The world of a fixed robot has the shapes of its base.  The surroundings of a floating robot are not its shapes.

@@ -148,11 +148,11 @@ def _collisions(prepared: Prepared, *postures: Array) -> Any:
     """Return the colliding shapes at each posture.  With surroundings, the optimization excludes collisions."""
     if prepared.problem.surroundings is not None:
         return (), ()
-    from impact_posture.collision.mesh_check import mesh_collisions
+    from impact_posture.collision.mesh_check import MeshCheck
     from impact_posture.collision.robot_shapes import load_shapes
 
-    shapes = load_shapes(prepared.impact.robot)
-    return tuple(mesh_collisions(prepared.impact.robot, shapes, q) for q in postures)
+    check = MeshCheck(prepared.impact.robot, load_shapes(prepared.impact.robot))
+    return tuple(check.collisions(q) for q in postures)
 
 
 def _tradeoff_data(points: Sequence[dict[str, Any]], against: Against) -> TradeOffData | None:

@@ -51,7 +51,7 @@ def set_armature(model: pin.Model, spec: RobotSpec, srdf: Path | None, option: A
     return source
 
 
-def armature_warning(model: pin.Model, source: str, held: Sequence[str] = ()) -> tuple[str, ...]:
+def armature_warning(model: pin.Model, source: str, held: Sequence[str]) -> tuple[str, ...]:
     """Return a warning about joints without armature, if there are any, except the joints ``held``."""
     armature = np.asarray(model.armature)
     counted = {i: str(model.names[i]) for i in joint_range(model) if model.names[i] not in held}

@@ -36,7 +36,7 @@ class RobotDescription(NamedTuple):
     mjcf: Any = None
 
 
-def read_description(path: Path, root: Root | None, *, accept_inertias: bool = False) -> RobotDescription:
+def read_description(path: Path, root: Root | None, *, accept_inertias: bool) -> RobotDescription:
     """Read a URDF, or an MJCF (see :func:`~impact_posture.robot.mjcf_file.is_mjcf`).
 
     ``root`` replaces the root of the file; ``None`` keeps it.  The root of a URDF is ``fixed``.

@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from impact_posture.collision import robot_shapes as collision_shapes
-from impact_posture.collision.mesh_check import mesh_collisions
+from impact_posture.collision.mesh_check import MeshCheck
 from impact_posture.collision.robot_shapes import NO_SHAPES, RobotShapes, load_shapes
 from impact_posture.collision.swept_hull import distance_from_hull, obstacle_hull
 from impact_posture.config import cached_values
@@ -216,7 +216,7 @@ def test_a_robot_without_shapes_says_so(tmp_path: Path) -> None:
     shapes = load_shapes(robot)
     assert shapes.warnings == (NO_SHAPES,)
     assert shapes.bodies == () and shapes.pairs.shape == (0, 2)
-    assert mesh_collisions(robot, shapes, robot.posture()) == []
+    assert MeshCheck(robot, shapes).collisions(robot.posture()) == []
 
 
 def test_a_hundred_thousand_faces_take_less_than_five_seconds(tmp_path: Path) -> None:

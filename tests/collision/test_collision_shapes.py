@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
-from impact_posture.collision.mesh_check import MeshCheck, mesh_collisions
+from impact_posture.collision.mesh_check import MeshCheck
 from impact_posture.collision.robot_shapes import load_shapes
 from impact_posture.collision.swept_hull import SweptHull, obstacle_hull, separation, transform
 from impact_posture.config.obstacle import Obstacle
@@ -133,30 +133,30 @@ def test_shapes_collide_only_where_hulls_do(name: str, seed: int) -> None:
     excused = {frozenset(joint[name] for name in pair) for pair in shapes.hulls_touching}
     joint = {shape.name: shape.parentJoint for shape in shapes.geometry.geometryObjects}
     assert {
-        frozenset(joint[name] for name in pair) for pair in mesh_collisions(robot, shapes, q)
+        frozenset(joint[name] for name in pair) for pair in MeshCheck(robot, shapes).collisions(q)
     } <= touching | excused
 
 
 def test_obstacles_and_planes_are_found_by_name() -> None:
     robot = robot_of("panda")
     shapes, q = load_shapes(robot), robot.posture()
-    assert mesh_collisions(robot, shapes, q) == []
+    assert MeshCheck(robot, shapes).collisions(q) == []
     data = robot.model.createData()
     pin.framesForwardKinematics(robot.model, data, q)
     hand = np.array(data.oMf[robot.frame_id("panda_hand")].act(np.array([0.0, 0.0, 0.04])))
     ball = Obstacle(name="ball", sphere=0.02, position=tuple(hand.tolist()))
     far = Obstacle(name="far", box=(0.1, 0.1, 0.1), position=(5.0, 0.0, 0.0))
-    hits = mesh_collisions(
-        robot, shapes, q, obstacles=[(obstacle_hull(body), pin.SE3.Identity(), ()) for body in (ball, far)]
+    hits = MeshCheck(robot, shapes).collisions(
+        q, obstacles=[(obstacle_hull(body), pin.SE3.Identity(), ()) for body in (ball, far)]
     )
     assert {name for _, name in hits} == {"ball"}
     assert {shape.partition("[")[0] for shape, _ in hits} <= {"panda_hand", "panda_leftfinger", "panda_rightfinger"}
     # The whole robot is above the ground except parts of its base, which are exempt.
     base = {0}
     ground = SimpleNamespace(name="ground", point=np.zeros(3), normal=np.array([0.0, 0.0, 1.0]), exempt=base)
-    assert mesh_collisions(robot, shapes, q, planes=[ground]) == []
+    assert MeshCheck(robot, shapes).collisions(q, planes=[ground]) == []
     ceiling = SimpleNamespace(name="ceiling", point=hand, normal=np.array([0.0, 0.0, -1.0]), exempt=base)
-    above = {shape for shape, plane in mesh_collisions(robot, shapes, q, planes=[ceiling]) if plane == "ceiling"}
+    above = {shape for shape, plane in MeshCheck(robot, shapes).collisions(q, planes=[ceiling]) if plane == "ceiling"}
     assert "panda_link4" in above and not any(shape.startswith("panda_link0") for shape in above)
 
 
@@ -169,7 +169,7 @@ def test_a_check_of_many_postures_equals_coal_on_each_shape(name: str, seed: int
     check.collisions(random_posture(robot, seed + 1))
     q = random_posture(robot, seed)
     collisions = check.collisions(q)
-    assert collisions == mesh_collisions(robot, shapes, q)
+    assert collisions == MeshCheck(robot, shapes).collisions(q)
     pin.forwardKinematics(robot.model, data, q)
     # coal cannot check meshes against swept hulls, so the sweep radius is zero.
     body = replace(shapes.bodies[int(random.integers(len(shapes.bodies)))], name="body", radius=0.0)
@@ -205,7 +205,7 @@ def test_a_collision_counts_from_a_micrometer(depth: float, hit: bool) -> None:
     lowest = min(_lowest(shape, data.oMi[shape.parentJoint]) for shape in shapes.geometry.geometryObjects)
     point, normal = np.array([0, 0, lowest + depth]), np.array([0.0, 0.0, 1.0])
     floor = SimpleNamespace(name="floor", point=point, normal=normal, exempt=())
-    assert bool(mesh_collisions(robot, shapes, q, planes=[floor])) is hit
+    assert bool(MeshCheck(robot, shapes).collisions(q, planes=[floor])) is hit
 
 
 def _lowest(shape: pin.GeometryObject, at: pin.SE3) -> float:
@@ -223,7 +223,7 @@ def test_default_postures_of_robots_with_turned_meshes_are_free(name: str) -> No
     """Both robots have COLLADA files with y up, but only the URDF of icub needs rotated meshes."""
     robot = robot_of(name)
     shapes = load_shapes(robot)
-    assert mesh_collisions(robot, shapes, robot.posture()) == []
+    assert MeshCheck(robot, shapes).collisions(robot.posture()) == []
     assert any("turned to z up" in line for line in shapes.warnings) is (name == "icub")
 
 

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from impact_posture.collision.coal_geometry import load_geometry
-from impact_posture.collision.mesh_check import mesh_collisions
+from impact_posture.collision.mesh_check import MeshCheck
 from impact_posture.collision.shape_corners import Corrected, mesh_points, mesh_triangles, renumbered
 from impact_posture.collision.swept_hull import obstacle_hull
 from impact_posture.collision.urdf_shapes import read_urdf_shapes
@@ -69,7 +69,7 @@ def test_the_check_sees_every_part_of_a_mesh(tmp_path: Path, monkeypatch: pytest
     for part in PARTS:
         # The plate intersects only one part of the mesh.
         plate = obstacle_hull(Obstacle(name="plate", box=(0.02, 0.2, 0.02), position=tuple((middle + part).tolist())))
-        seen.append(bool(mesh_collisions(shapes.robot, shapes, q, obstacles=[(plate, pin.SE3.Identity(), ())])))
+        seen.append(bool(MeshCheck(shapes.robot, shapes).collisions(q, obstacles=[(plate, pin.SE3.Identity(), ())])))
     assert seen == [True, right, right]
     # With correct triangles, the mesh extends to its farthest corners.
     reach = mesh_points(solid)[mesh_triangles(solid)][..., 0].max()

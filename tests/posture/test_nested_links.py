@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from impact_posture.collision.joint_planes import JointPlanes, joint_planes
-from impact_posture.collision.mesh_check import mesh_collisions
+from impact_posture.collision.mesh_check import MeshCheck
 from impact_posture.collision.robot_shapes import RobotShapes, load_shapes
 from impact_posture.collision.shape_pairs import random_postures
 from impact_posture.dynamics.numeric import Numeric
@@ -84,7 +84,7 @@ def test_a_rod_may_be_in_a_channel_and_not_in_its_walls(
     free, allowed = 0, 0
     for q in random_postures(robot, 200):
         gap = float(min(INNER - ROD - abs(q[0]), 0.15 + q[1] - ROD))
-        assert bool(mesh_collisions(robot, shapes, q)) is (gap < 0)
+        assert bool(MeshCheck(robot, shapes).collisions(q)) is (gap < 0)
         assert gap > 0 or not within(robot, planes, q)
         free, allowed = free + (gap > 0), allowed + within(robot, planes, q)
     assert 100 < free < 190
@@ -106,7 +106,7 @@ def test_nested_bodies_keep_apart_and_most_of_their_free_positions(name: str) ->
         assert within(robot, planes, robot.posture())
     free, kept = np.zeros((2, len(shapes.joint_planes)), dtype=int)
     for q in random_postures(robot, 200):
-        hit = {frozenset(pair) for pair in mesh_collisions(robot, shapes, q)}
+        hit = {frozenset(pair) for pair in MeshCheck(robot, shapes).collisions(q)}
         apart = np.array([frozenset(planes.bodies) not in hit for planes in shapes.joint_planes])
         inside = np.array([within(robot, planes, q) for planes in shapes.joint_planes])
         assert not (inside & ~apart).any()
@@ -203,6 +203,6 @@ def test_within_the_planes_the_waist_of_g1_does_not_touch(seed: int) -> None:
     q = robot.posture()
     at = [robot.model.idx_qs[robot.joint_id(name)] for name in WAIST]
     q[at] = np.random.default_rng(seed).uniform(-0.52, 0.52, 2)
-    touching = set(planes.bodies) in [set(pair) for pair in mesh_collisions(robot, load_shapes(robot), q)]
+    touching = set(planes.bodies) in [set(pair) for pair in MeshCheck(robot, load_shapes(robot)).collisions(q)]
     assert not (touching and (constraint.value(numeric.at(q)) <= constraint.upper).all())
     check_expression(constraint, robot.model, [q])
