@@ -71,29 +71,9 @@ def rounding_of_this_run(request: pytest.FixtureRequest) -> Iterator[None]:
         yield
 
 
-# Robot with one link that rotates about z.  If the link points along x, its tip cannot move along x.
-PENDULUM = """<robot name="pendulum">
-  <link name="base"/>
-  <link name="arm"><inertial><origin xyz="0.5 0 0"/><mass value="2"/>
-    <inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1"/></inertial></link>
-  <link name="tip"/>
-  <joint name="swing" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 0 1"/>
-    <limit lower="-3" upper="3" effort="1" velocity="1"/></joint>
-  <joint name="end" type="fixed"><parent link="arm"/><child link="tip"/><origin xyz="1 0 0"/></joint>
-</robot>
-"""
-
-
 @pytest.fixture(scope="module")
 def small() -> WorstCaseObjective:
     robot = load_robot("tilthex_arm")
     return WorstCaseObjective(
         robot, ImpactContact("ee", (1.0, 0.3, -0.2), (0.01, 0.02, 0.0), impulse=1.7), kind="sticking"
     )
-
-
-@pytest.fixture
-def pendulum(tmp_path: Path) -> str:
-    path = tmp_path / "pendulum.urdf"
-    path.write_text(PENDULUM)
-    return str(path)

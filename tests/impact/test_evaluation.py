@@ -29,32 +29,23 @@ from tests.support.helpers import (
     robot,
     unit,
 )
+from tests.support.urdfs import joint, link, write
 
 DESIGN_KEYS = {
     "q", "objective", "H", "G", "V", "S", "E", "effective_mass", "gradient", "objective_gradient", "worst_normal",
     "ellipsoid", "pose",
 }  # fmt: skip
 
-PLANAR = """<robot name="planar">
-  <link name="base"/>
-  {links}
-  <joint name="j1" type="revolute"><parent link="base"/><child link="l1"/><axis xyz="0 0 1"/>
-    <limit lower="-3" upper="3" velocity="2" effort="10"/></joint>
-  <joint name="j2" type="revolute"><parent link="l1"/><child link="l2"/><origin xyz="0.5 0 0"/><axis xyz="0 0 1"/>
-    <limit lower="-3" upper="3" velocity="2" effort="10"/></joint>
-  <joint name="jt" type="fixed"><parent link="l2"/><child link="tip"/><origin xyz="0.5 0 0"/></joint>
-</robot>"""
-LINK = """<link name="{0}"><inertial><origin xyz="0.25 0 0"/><mass value="{1}"/>
-  <inertia ixx="0.01" iyy="0.02" izz="{2}" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
-
 
 @pytest.fixture
 def planar(tmp_path: Path) -> str:
     """Return a two-link arm that moves in the xy plane."""
-    links = LINK.format("l1", 2.0, 0.02) + LINK.format("l2", 1.0, 0.015) + '<link name="tip"/>'
-    path = tmp_path / "planar.urdf"
-    path.write_text(PLANAR.format(links=links))
-    return str(path)
+    parts = [
+        link("base"), link("l1", 2, "0.25 0 0"), link("l2", 1, "0.25 0 0"), link("tip"),
+        joint("j1", "base l1", "0 0 1"), joint("j2", "l1 l2", "0 0 1", "0.5 0 0"),
+        joint("jt", "l2 tip", None, "0.5 0 0", "fixed", ""),
+    ]  # fmt: skip
+    return str(write(tmp_path, *parts))
 
 
 def dense(
@@ -306,7 +297,7 @@ def test_an_impact_at_a_held_point_is_refused() -> None:
 
 def test_a_robot_without_a_default_frame_names_some(planar: str) -> None:
     with pytest.raises(
-        ContactError, match="frame: planar has no default contact frame; give a frame, for example tip"
+        ContactError, match="frame: written has no default contact frame; give a frame, for example tip"
     ):
         resolve(ImpactSettings(robot=planar, normal=(1.0, 0.0, 0.0)))
 

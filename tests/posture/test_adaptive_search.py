@@ -18,21 +18,15 @@ from impact_posture.posture.manifold import batch_function
 from impact_posture.posture.manifold.batch_descent import BatchDescent, Ends
 from impact_posture.posture.manifold.batch_function import BatchFunction
 from impact_posture.posture.manifold.constraint_manifold import ConstraintManifold
-from impact_posture.posture.manifold.feasible_start import random_posture
 from impact_posture.posture.program.posture_nlp import build_nlp
 from impact_posture.posture.search import screening as screening_module
 from impact_posture.posture.search.growing_search import run_start
 from impact_posture.posture.search.multistart import PostureSolution, solve
 from impact_posture.posture.search.screening import screen, screenable
 from impact_posture.posture.search.unseen_optima import SAME_VALUE, SearchEstimate, hits_by_value
+from tests.posture.test_self_motion import drawn
 from tests.support.command import run
 from tests.support.settings import make_settings
-
-
-def postures(manifold: ConstraintManifold, count: int) -> np.ndarray:
-    rng = np.random.default_rng(0)
-    drawn = [random_posture(manifold.problem, manifold.chart, rng) for _ in range(count)]
-    return np.array([manifold.chart.to_x(q) for q in drawn])
 
 
 def descended(manifold: ConstraintManifold, x: np.ndarray) -> Ends:
@@ -54,7 +48,7 @@ def descended(manifold: ConstraintManifold, x: np.ndarray) -> Ends:
 def test_a_batch_equals_single_calls(name: str) -> None:
     manifold = ConstraintManifold(CASES[name].problem())
     # Two full runs of the operations, and a third with one posture.
-    x = postures(manifold, 2 * batch_function._WIDTH + 1)
+    x = drawn(manifold, 2 * batch_function._WIDTH + 1, 0)
     for function in (manifold._objective, manifold._equalities):
         assert function._operations is not None
         for together, alone in zip(function(x), function._one_by_one((x,)), strict=True):
@@ -84,7 +78,7 @@ def test_a_branch_that_is_not_taken_may_be_undefined() -> None:
 def test_the_merit_has_the_gradient_of_finite_differences() -> None:
     problem = prepare(make_settings({"robot": "solo12", "normal": (1, 0, 0), "com": True})).problem
     manifold, size = ConstraintManifold(problem), 1e-6
-    x = postures(manifold, 4)
+    x = drawn(manifold, 4, 0)
     gradient = manifold.evaluate(x).gradient
     for k in range(manifold.chart.nv):
         step = np.zeros((4, manifold.chart.nv))
@@ -97,7 +91,7 @@ def test_the_merit_has_the_gradient_of_finite_differences() -> None:
 def test_descents_end_near_optima_on_the_constraints(number: int) -> None:
     problem = random_arm(number)
     manifold = ConstraintManifold(problem)
-    x = manifold.project(postures(manifold, 80), within=True)
+    x = manifold.project(drawn(manifold, 80, 0), within=True)
     before = x.x[x.converged]
     ends = descended(manifold, before)
     assert len(ends.x) >= len(before) / 2
@@ -120,7 +114,7 @@ def test_a_joint_that_is_held_does_not_move() -> None:
     ).problem
     manifold = ConstraintManifold(problem)
     column = problem.robot.model.idx_vs[problem.robot.joint_id("panda_joint2")]
-    x = postures(manifold, 70)
+    x = drawn(manifold, 70, 0)
     start = manifold.chart.to_x(problem.given)[column]
     x[:, column] = start
     ends = descended(manifold, x)
@@ -248,7 +242,7 @@ def test_every_answer_states_the_estimate(tmp_path: Path) -> None:
 def test_full_turns_do_not_leave_the_limits() -> None:
     problem = prepare(make_settings({"robot": "ur5", "normal": (0, 0, 1)})).problem
     manifold = ConstraintManifold(problem)
-    ends = descended(manifold, postures(manifold, 70))
+    ends = descended(manifold, drawn(manifold, 70, 0))
     model = problem.robot.model
     for posture in ends.x:
         q = manifold.to_q(posture)

@@ -36,7 +36,9 @@ from impact_posture.sweep.shard_table import read_shard
 from impact_posture.sweep.sweep_file import Axis, Grid, read_sweep
 from impact_posture.sweep.sweep_run import SweepRun, run_sweep
 from impact_posture.system.processes import process_pool
+from tests.support import urdfs
 from tests.support.command import refused, run
+from tests.support.urdfs import joint, link
 
 # The tool of the aerial manipulator points down.
 DOWN, TILTED = (1.0, 0.0, 0.0, 0.0), (float(np.cos(0.1)), 0.0, -float(np.sin(0.1)), 0.0)
@@ -304,16 +306,16 @@ def test_neighboring_shards_share_their_optima(tmp_path: Path) -> None:
         assert certify(problem, q, before[point]).holds()
 
 
-def test_the_key_depends_on_files_of_the_robot_and_the_posture(pendulum: str, tmp_path: Path) -> None:
+def test_the_key_depends_on_files_of_the_robot_and_the_posture(tmp_path: Path) -> None:
     """Neither limits nor posture files belong to the dynamics."""
-    urdf, posture = Path(pendulum), tmp_path / "posture.json"
-    text = f'[problem]\nrobot = {json.dumps(pendulum)}\nframe = "tip"\nnormal = [0, 1, 0]\nposture = "posture.json"\n'
-    (tmp_path / "sweep.toml").write_text(text + '[grid]\nobjective = ["impulse"]\n', encoding="utf-8")
-    keys = []
-    for upper, angle in (("3", 0.1), ("3", 0.1), ("2.5", 0.1), ("2.5", 0.2)):
-        urdf.write_text(urdf.read_text(encoding="utf-8").replace('upper="3"', f'upper="{upper}"'), encoding="utf-8")
+    urdf = urdfs.write(tmp_path, link("base"), link("arm", 2, "0.5 0 0"), joint("swing", "base arm", "0 0 1"))
+    posture = tmp_path / "posture.json"
+    text = '[problem]\nrobot = "written.urdf"\nframe = "arm"\nnormal = [0, 1, 0]\nposture = "posture.json"\n'
+    sweep, keys = write(text + '[grid]\nobjective = ["impulse"]\n', tmp_path), []
+    for upper, angle in (("2.5", 0.1), ("2.5", 0.1), ("2", 0.1), ("2", 0.2)):
+        urdf.write_text(urdf.read_text(encoding="utf-8").replace('upper="2.5"', f'upper="{upper}"'), encoding="utf-8")
         posture.write_text(json.dumps({"joints": {"swing": angle}}), encoding="utf-8")
-        keys.append(sweep_key(read_sweep(tmp_path / "sweep.toml")))
+        keys.append(sweep_key(read_sweep(sweep)))
     assert keys[0] == keys[1] and len(set(keys)) == 3
 
 
