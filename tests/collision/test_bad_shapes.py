@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import stat
-import struct
 import time
 from pathlib import Path
 
@@ -25,39 +24,23 @@ from impact_posture.config.table_validation import validate
 from impact_posture.errors import InputError, SpecError, UrdfError
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
-from impact_posture.system.arrays import Array
+from tests.support.urdfs import joint, link, stl
 
 TETRAHEDRON = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])
 FACES = [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]
 BOX = '<box size="0.1 0.1 0.2"/>'
+SHOULDER = joint("shoulder", "base middle", at="0 0 0.3")
 
 
-def stl(path: Path, triangles: Array) -> Path:
-    records = np.zeros(len(triangles), dtype=[("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("unused", "<u2")])
-    records["corners"] = triangles
-    path.write_bytes(b"\0" * 80 + struct.pack("<I", len(triangles)) + records.tobytes())
-    return path
-
-
-def link(name: str, *geometries: str, tag: str = "collision") -> str:
-    shapes = "".join(f"<{tag}><geometry>{geometry}</geometry></{tag}>" for geometry in geometries)
-    inertial = (
-        '<inertial><mass value="1"/><inertia ixx="1e-2" iyy="1e-2" izz="1e-2" ixy="0" ixz="0" iyz="0"/></inertial>'
-    )
-    return f'<link name="{name}">{inertial}{shapes}</link>'
-
-
-def joint(parent: str, child: str) -> str:
-    return (
-        f'<joint name="to_{child}" type="revolute"><parent link="{parent}"/><child link="{child}"/>'
-        '<origin xyz="0 0 0.3"/><axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="1" velocity="1"/></joint>'
-    )
+def shaped(name: str, *geometries: str, tag: str = "collision") -> str:
+    """Return a link with shapes."""
+    return link(name, 1, more="".join(f"<{tag}><geometry>{geometry}</geometry></{tag}>" for geometry in geometries))
 
 
 def arm(folder: Path, *shapes: str, tag: str = "collision") -> RobotShapes:
     """Return the shapes of an arm with three links: a box, the given shapes, and a box."""
-    text = f'<robot name="arm">{link("base", BOX)}{link("middle", *shapes, tag=tag)}{link("tip", BOX)}'
-    (folder / "arm.urdf").write_text(f"{text}{joint('base', 'middle')}{joint('middle', 'tip')}</robot>")
+    text = f'<robot name="arm">{shaped("base", BOX)}{shaped("middle", *shapes, tag=tag)}{shaped("tip", BOX)}'
+    (folder / "arm.urdf").write_text(f"{text}{SHOULDER}{joint('elbow', 'middle tip', at='0 0 0.3')}</robot>")
     return load_shapes(load_robot(str(folder / "arm.urdf"), armature="none"))
 
 
@@ -130,12 +113,12 @@ def test_a_bad_description_is_left_out_by_name(tmp_path: Path, geometry: str, fa
     from impact_posture.collision.urdf_shapes import read_urdf_shapes
 
     stl(tmp_path / "good.stl", TETRAHEDRON[FACES])
-    text = f'<robot name="arm">{link("base", BOX)}{link("middle", BOX)}{joint("base", "middle")}</robot>'
+    text = f'<robot name="arm">{shaped("base", BOX)}{shaped("middle", BOX)}{SHOULDER}</robot>'
     urdf = tmp_path / "arm.urdf"
     urdf.write_text(text)
     robot = load_robot(str(urdf), armature="none")
     # Add the invalid shape after the robot is loaded, because some Pinocchio versions cannot read such shapes.
-    urdf.write_text(text.replace(link("middle", BOX), link("middle", geometry)))
+    urdf.write_text(text.replace(shaped("middle", BOX), shaped("middle", geometry)))
     shapes, (line,), links = read_urdf_shapes(robot)
     assert [shape.name for shape in shapes] == ["base"] and links == ["base", "middle"]
     assert line.startswith("shape middle is left out: ") and fault in line
@@ -149,7 +132,7 @@ def test_a_ball_of_millimeters_is_left_out(tmp_path: Path) -> None:
 
 
 def test_files_that_change_after_loading_are_one_line(tmp_path: Path) -> None:
-    text = f'<robot name="arm">{link("base", BOX)}{link("middle", BOX)}{joint("base", "middle")}</robot>'
+    text = f'<robot name="arm">{shaped("base", BOX)}{shaped("middle", BOX)}{SHOULDER}</robot>'
     urdf, srdf = tmp_path / "arm.urdf", tmp_path / "arm.srdf"
     urdf.write_text(text)
     srdf.write_text('<robot name="arm"/>')
@@ -158,7 +141,7 @@ def test_files_that_change_after_loading_are_one_line(tmp_path: Path) -> None:
         return load_robot(str(urdf), armature="none", srdf=str(srdf))
 
     robot = load()
-    urdf.write_text(text.replace("</robot>", f"{link('new')}</robot>"))
+    urdf.write_text(text.replace("</robot>", f"{shaped('new')}</robot>"))
     with pytest.raises(UrdfError, match="has changed since the robot was loaded"):
         load_shapes(robot)
     urdf.unlink()
@@ -203,15 +186,15 @@ def test_millimeters_with_a_scale_and_mirrored_meshes_are_fine(tmp_path: Path) -
 def test_meshes_of_packages_and_visual_shapes(tmp_path: Path) -> None:
     (tmp_path / "elsewhere" / "parts").mkdir(parents=True)
     stl(tmp_path / "elsewhere" / "parts" / "a b.stl", TETRAHEDRON[FACES])
-    text = f'<robot name="arm">{link("base", BOX)}' + link("middle", mesh("package://parts/a b.stl"), tag="visual")
-    (tmp_path / "arm.urdf").write_text(f"{text}{joint('base', 'middle')}</robot>")
+    middle = shaped("middle", mesh("package://parts/a b.stl"), tag="visual")
+    (tmp_path / "arm.urdf").write_text(f'<robot name="arm">{shaped("base", BOX)}{middle}{SHOULDER}</robot>')
     folder = str(tmp_path / "elsewhere")
     shapes = load_shapes(load_robot(str(tmp_path / "arm.urdf"), armature="none", package_dir=(folder,)))
     assert [body.link for body in shapes.bodies] == ["base", "middle"] and not shapes.warnings
 
 
 def test_a_robot_without_shapes_says_so(tmp_path: Path) -> None:
-    (tmp_path / "arm.urdf").write_text(f'<robot name="arm">{link("base")}{link("tip")}{joint("base", "tip")}</robot>')
+    (tmp_path / "arm.urdf").write_text(f'<robot name="arm">{shaped("base")}{shaped("middle")}{SHOULDER}</robot>')
     robot = load_robot(str(tmp_path / "arm.urdf"), armature="none")
     shapes = load_shapes(robot)
     assert shapes.warnings == (NO_SHAPES,)

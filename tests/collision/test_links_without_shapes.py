@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.collision.test_bad_shapes import FACES, TETRAHEDRON, stl
+from tests.collision.test_bad_shapes import FACES, TETRAHEDRON
 from tests.support.command import run
+from tests.support.urdfs import stl
 
 TWINBOOM = Path(__file__).parent / "twinboom.urdf"
 BENT = "{ waist = 0.0, s = -0.5, e = 0.9, boom = 1.4, jib_joint = 0.6 }"

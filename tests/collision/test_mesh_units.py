@@ -13,8 +13,8 @@ import pytest
 
 from impact_posture.collision.robot_shapes import load_shapes
 from impact_posture.output.report.drawn_robot import draw_robot
-from impact_posture.robot.robot_loader import load_robot
 from impact_posture.system.arrays import Array
+from tests.support.urdfs import joint, link, load
 
 # A box of 1 × 2 × 3 units.
 CORNERS = [(x, y, z) for x in (0, 1) for y in (0, 2) for z in (0, 3)]
@@ -23,7 +23,6 @@ FACES = [
     (2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3),
 ]  # fmt: skip
 POINTS = " ".join(f"{x} {y} {z}" for x, y, z in CORNERS)
-INERTIAL = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
 
 
 def collada(asset: str, node: str = "") -> str:
@@ -107,13 +106,8 @@ def write_gltf(path: Path, root: dict[str, object]) -> None:
 def extents(folder: Path, mesh: str, scale: str = "") -> tuple[Array, tuple[str, ...]]:
     """Return the edge lengths of a collision mesh, m, and the warnings; check that the drawn mesh agrees."""
     described = f'<geometry><mesh filename="{mesh}"{scale}/></geometry>'
-    urdf = folder / "robot.urdf"
-    urdf.write_text(
-        f'<robot name="r"><link name="a"/><link name="b">{INERTIAL}<collision>{described}</collision>'
-        f'<visual>{described}</visual></link><joint name="j" type="revolute"><parent link="a"/><child link="b"/>'
-        '<limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>'
-    )
-    robot = load_robot(str(urdf), armature="none")
+    tags = f"<collision>{described}</collision><visual>{described}</visual>"
+    robot = load(folder, link("a"), link("b", 1, more=tags), joint("j", "a b"), armature="none")
     shapes = load_shapes(robot)
     if not shapes.bodies:
         return np.zeros(3), shapes.warnings

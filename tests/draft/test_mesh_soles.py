@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
+from scipy.spatial import ConvexHull
 
 from impact_posture.config.problem_settings import LoadOptions
 from impact_posture.draft.draft import write_draft
@@ -17,8 +18,9 @@ from impact_posture.posture.formulation.problem_file import Prepared, prepare
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.robot.robot_spec import RobotSpec, read_spec
 from impact_posture.system.arrays import Array
-from tests.support.biped import biped, write_hull
+from tests.support.biped import biped
 from tests.support.settings import make_settings
+from tests.support.urdfs import stl
 
 # The box of a sole of 20 × 8 × 3 cm, whose lower face is 6 cm below the ankle.
 SOLE = np.array(list(product((-0.08, 0.12), (-0.04, 0.04), (-0.06, -0.03))))
@@ -41,7 +43,7 @@ def ball() -> Array:
 
 
 def drafted(folder: Path, foot: str, mesh: Array = SOLE) -> RobotSpec:
-    write_hull(folder / "foot.stl", mesh)
+    stl(folder / "foot.stl", mesh[ConvexHull(mesh).simplices])
     (folder / "biped.urdf").write_text(biped(foot))
     return read_spec(write_draft(str(folder / "biped.urdf"), LoadOptions(), None, force=True)[0])
 
@@ -89,7 +91,7 @@ def test_sensors_below_a_sole_are_not_feet(tmp_path: Path) -> None:
 
 def test_feet_with_different_shapes_are_a_guess(tmp_path: Path) -> None:
     """Published robots may have collision shapes for one foot and only a visual mesh for the other."""
-    write_hull(tmp_path / "foot.stl", SOLE - 1.5 * UP)
+    stl(tmp_path / "foot.stl", (SOLE - 1.5 * UP)[ConvexHull(SOLE).simplices])
     left, _, right = biped(BOX).rpartition(BOX)
     for other, words in ((MESH.format(""), "differ by 3 mm in height, so compare their shapes"), (BOX, "")):
         (tmp_path / "biped.urdf").write_text(left + other + right)

@@ -21,8 +21,9 @@ from impact_posture.posture.constraints.linear_joints import LinearJoints
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.system.arrays import Array
-from tests.collision.test_bad_shapes import link, mesh, stl
+from tests.collision.test_bad_shapes import mesh, shaped
 from tests.support.constraints import check_expression
+from tests.support.urdfs import stl
 
 CUBE = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 SIDES = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
@@ -48,7 +49,7 @@ def rod_in_channel(folder: Path, turn: Array) -> tuple[Robot, RobotShapes]:
         box((-0.15, INNER, 0), (0.15, width, 0.3)),
     ])  # fmt: skip
     stl(folder / "channel.stl", channel @ turn.T)
-    text = f'<robot name="channel">{link("frame", mesh("channel.stl"))}{link("slide")}'
+    text = f'<robot name="channel">{shaped("frame", mesh("channel.stl"))}{shaped("slide")}'
     rpy = " ".join(map(str, pin.rpy.matrixToRpy(turn)))
     for parent, child, origin, axis in (
         ("frame", "slide", turn @ [0, 0, 0.15], "y"),
@@ -61,7 +62,8 @@ def rod_in_channel(folder: Path, turn: Array) -> tuple[Robot, RobotShapes]:
             f'<axis xyz="{"0 1 0" if axis == "y" else "0 0 1"}"/>'
             '<limit lower="-0.12" upper="0.12" effort="1" velocity="1"/></joint>'
         )
-    (folder / "channel.urdf").write_text(f'{text}{link("rod", f"""<box size="0.2 {2 * ROD} {2 * ROD}"/>""")}</robot>')
+    rod = shaped("rod", f'<box size="0.2 {2 * ROD} {2 * ROD}"/>')
+    (folder / "channel.urdf").write_text(f"{text}{rod}</robot>")
     robot = load_robot(str(folder / "channel.urdf"), armature="none")
     return robot, load_shapes(robot)
 

@@ -1,23 +1,8 @@
-"""A biped with legs of six joints, whose feet have a given shape, and binary STL files."""
+"""A biped with legs of six joints, whose feet have a given shape."""
 
 from __future__ import annotations
 
-import struct
-from pathlib import Path
-
-import numpy as np
-from scipy.spatial import ConvexHull
-
-from impact_posture.system.arrays import Array
 from tests.support.urdfs import joint, link
-
-
-def write_hull(path: Path, points: Array) -> None:
-    """Write the convex hull of points, shape (k, 3), as a binary STL file."""
-    triangles = points[ConvexHull(points).simplices]
-    records = np.zeros(len(triangles), dtype=[("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("unused", "<u2")])
-    records["corners"] = triangles
-    path.write_bytes(b"\0" * 80 + struct.pack("<I", len(triangles)) + records.tobytes())
 
 
 def biped(foot: str, ankle_roll: bool = True) -> str:
@@ -25,7 +10,7 @@ def biped(foot: str, ankle_roll: bool = True) -> str:
 
     The ankles are 0.66 m below the hips.  Without ``ankle_roll``, the legs have five joints.
     """
-    hips = _link("hips", 8.0, _box("0.16 0.2 0.12", 0.1))
+    hips = link("hips", 8.0, more=_box("0.16 0.2 0.12", 0.1))
     return (
         f'<robot name="biped">{hips}{_leg("left", 1, foot, ankle_roll)}{_leg("right", -1, foot, ankle_roll)}</robot>'
     )
@@ -46,13 +31,9 @@ def _leg(side: str, sign: int, foot: str, ankle_roll: bool) -> str:
     for name, xyz, axis, (low, high), mass, shapes in links:
         child, limit = f"{side}_{name}", f'<limit lower="{low}" upper="{high}" effort="100" velocity="5"/>'
         text += joint(f"to_{child}", f"{parent} {child}", axis, xyz.format(y=0.1 * sign), more=limit)
-        text += _link(child, mass, shapes)
+        text += link(child, mass, more=shapes)
         parent = child
     return text
-
-
-def _link(name: str, mass: float, shapes: str) -> str:
-    return link(name, mass).replace("</link>", f"{shapes}</link>")
 
 
 def _box(size: str, z: float) -> str:
