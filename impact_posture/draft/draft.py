@@ -20,9 +20,9 @@ from impact_posture.robot.model_joints import joint_family
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_collections import COLLECTIONS
 from impact_posture.robot.robot_loader import Located, build_robot, known_robots, load_robot, locate
-from impact_posture.robot.robot_spec import SCHEMA, RobotSpec, Support
+from impact_posture.robot.robot_spec import SCHEMA, ModelSpec, RobotSpec, Support
 from impact_posture.robot.support_polygon import polygon_edges
-from impact_posture.robot.urdf import EXAMPLE_PREFIX, example_robot_data, resolve_path
+from impact_posture.robot.urdf import EXAMPLE_PREFIX, example_robot_data
 from impact_posture.system.escape import toml
 from impact_posture.system.output_folder import check_name
 
@@ -51,11 +51,9 @@ def write_draft(robot: str, options: LoadOptions, out: Path | None, *, force: bo
         hint = "name a .urdf, or write the differences into a file and give it by `config`"
         raise InputError("has its robot.toml already", where=robot, hint=hint)
     # The empty file os.devnull is read in place of a robot.toml beside the URDF.
-    located = locate(
-        robot, LoadOptions(config=os.devnull, package_dir=options.package_dir, xacro_arg=options.xacro_arg)
-    )
+    located = locate(robot, replace(options, config=os.devnull))
     in_package = located.source.startswith(COLLECTIONS)
-    out = out or (Path(f"{located.urdf.stem}.toml") if in_package else located.home / "robot.toml")
+    out = out or (Path(f"{located.files.urdf.stem}.toml") if in_package else located.home / "robot.toml")
     check_name(out)
     if out.exists() and not force:
         raise OutputError("exists", where=str(out), hint="name another file, or `force` to replace it")
@@ -78,8 +76,7 @@ def write_draft(robot: str, options: LoadOptions, out: Path | None, *, force: bo
 
 def draft_spec(located: Located, options: LoadOptions, folder: Path) -> Draft:
     """Return the draft for a URDF, with paths relative to ``folder``."""
-    known = options.srdf or located.spec.model.srdf
-    srdf = resolve_path(known, Path()) if known else guess.srdf_near(located.home / located.urdf.name)
+    srdf = located.files.srdf or guess.srdf_near(located.home / located.files.urdf.name)
     try:
         robot = _load(located, options, options.root, srdf)
     except UrdfError as error:  # A fixed robot without joints cannot move.
@@ -117,7 +114,7 @@ def draft_spec(located: Located, options: LoadOptions, folder: Path) -> Draft:
         chosen = f"the {_file(robot, 'SRDF')} names {states}{only}"
         draft.key("default_posture", default, chosen, guessed=True)
     draft.lines += ["", "[model]"]
-    if srdf is not None and not located.spec.model.srdf:
+    if srdf is not None and (options.srdf or located.files.srdf is None):
         draft.key("srdf", _path(srdf, folder), "as --srdf says" if options.srdf else "found near the URDF")
     draft.key("root", root, why, guessed=options.root is None and robot.mjcf is None)
     _model(draft, robot, options, folder)
@@ -144,11 +141,9 @@ def draft_spec(located: Located, options: LoadOptions, folder: Path) -> Draft:
 
 def _load(located: Located, options: LoadOptions, root: Root | None, srdf: Path | None) -> Robot:
     """Load the robot without a robot.toml; impossible inertias become warnings."""
-    plain = LoadOptions(
-        package_dir=options.package_dir, armature=options.armature, lock=options.lock, lock_massless=True
-    )
-    model = replace(located.spec.model, root=root, srdf=None if srdf is None else str(srdf), accept_inertias=True)
-    return build_robot(located._replace(spec=RobotSpec(model=model)), plain)
+    plain = LoadOptions(armature=options.armature, lock=options.lock, lock_massless=True)
+    spec = RobotSpec(model=ModelSpec(root=root, accept_inertias=True))
+    return build_robot(located._replace(spec=spec, files=replace(located.files, srdf=srdf)), plain)
 
 
 def _model(draft: Draft, robot: Robot, options: LoadOptions, folder: Path) -> None:

@@ -37,7 +37,7 @@ class CollectedRobot(NamedTuple):
     """
 
     path: Path
-    folders: tuple[str, ...] = ()
+    folders: tuple[Path, ...] = ()
     srdf: str | None = None
     packages: Mapping[str, str] = {}
     arguments: Mapping[str, str] = {}
@@ -120,7 +120,7 @@ def _from_descriptions(name: str) -> CollectedRobot:
     homes = [Path(module.PACKAGE_PATH), Path(module.REPOSITORY_PATH)]
     return CollectedRobot(
         Path(path),
-        tuple(str(folder) for home in homes for folder in (home, home.parent)),
+        tuple(folder for home in homes for folder in (home, home.parent)),
         getattr(module, "SRDF_PATH", None),
         getattr(module, "XACRO_PACKAGE_PATHS", {}),
         getattr(module, "XACRO_ARGS", {}),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -14,7 +14,7 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.config.checked import checked
-from impact_posture.config.problem_settings import LoadOptions, RobotSettings, Root, Vector3
+from impact_posture.config.problem_settings import LoadOptions, RobotSettings, Vector3
 from impact_posture.config.table_validation import validate
 from impact_posture.errors import (
     InputError,
@@ -73,23 +73,21 @@ def load_robot(robot: str, options: LoadOptions | None = None, **settings: Any) 
 
 def build_robot(located: Located, options: LoadOptions) -> Robot:
     """Build the robot that a URDF or MJCF and a ``robot.toml`` describe; see :func:`load_robot` for errors."""
-    spec, urdf, source, base, name, _ = located
-    _check_package_dirs(options.package_dir, Path(), "package_dir")
-    _check_package_dirs(spec.model.package_dirs, base, f"{name} robot.toml [model] package_dirs")
-    described = read_description(urdf, options.root or spec.model.root, accept_inertias=spec.model.accept_inertias)
+    spec, files, source, name, _ = located
+    root = options.root or spec.model.root
+    described = read_description(files.urdf, root, accept_inertias=spec.model.accept_inertias)
     model, warnings = described.model, described.warnings
-    root: Root = "free-flyer" if is_free_flyer(model) else "fixed"
+    root = "free-flyer" if is_free_flyer(model) else "fixed"
     _check_names(model, source)
     _remount(model, options.mounting, name)
-    srdf = _srdf_path(spec, options, base)
     _override_limits(model, spec, name)
     _check_limits(model, source)
     couplings = described.couplings
     warnings = (*warnings, *couple_limits(model, couplings))
     model.lowerVelocityLimit, model.lowerEffortLimit = -model.upperVelocityLimit, -model.upperEffortLimit
-    postures, default = named_postures(described, srdf, spec, name)
+    postures, default = named_postures(described, files.srdf, spec, name)
     postures = {key: coupled(model, couplings, q) for key, q in postures.items()}
-    armature_source = set_armature(model, spec, srdf, options.armature, name)
+    armature_source = set_armature(model, spec, files.srdf, options.armature, name)
     check_any_mass(model, source)
     locked = _named(model, (*spec.model.lock, *options.lock), f"{name} lock")
     if spec.model.lock_massless or options.lock_massless:
@@ -106,23 +104,15 @@ def build_robot(located: Located, options: LoadOptions) -> Robot:
     check_moved_mass(model, source)
     warnings = (*warnings, *_immovable(model))
     if root == "fixed":
-        warnings = (*warnings, *ignored_bases(spec, srdf, default))
+        warnings = (*warnings, *ignored_bases(spec, files.srdf, default))
     warnings = (*warnings, *armature_warning(model, armature_source, spec.constraints.hold))
     loaded = Robot(
         name=name, source=source, model=model, root=root, postures=postures, default_posture=default, spec=spec,
         locked=locked, armature_source=armature_source, warnings=warnings, couplings=present(couplings, model),
-        files=RobotFiles(urdf, srdf, _package_folders(spec, options, base)), mjcf=mjcf,
+        files=files, mjcf=mjcf,
     )  # fmt: skip
     check_mass_matrix(loaded, source)
     return loaded
-
-
-def _check_package_dirs(folders: Sequence[str], base: Path, where: str) -> None:
-    for folder in folders:
-        path = base / Path(folder).expanduser()
-        if not os.path.isdir(path):
-            siblings = sorted(str(Path(folder).with_name(p.name)) for p in path.parent.glob("*") if p.is_dir())
-            raise PackageNotFound(folder, siblings, where=where, hint="name an existing folder")
 
 
 def names_a_path(robot: str, folder: Path) -> bool:
@@ -156,16 +146,13 @@ class Located(NamedTuple):
     """Files of a robot before its URDF or MJCF is read.
 
     Attributes:
-        urdf: The URDF or MJCF; for a xacro file, the URDF in the cache.
         source: Name, path or URI in outputs.
-        folder: Folder from which relative paths in ``spec`` start.
         home: Folder of the file that the user named.
     """
 
     spec: RobotSpec
-    urdf: Path
+    files: RobotFiles
     source: str
-    folder: Path
     name: str
     home: Path
 
@@ -186,33 +173,35 @@ def locate(robot: str, options: LoadOptions) -> Located:
             if chosen != urdf:
                 urdf = chosen
                 source = text if (text := spec.model.urdf or "").startswith(EXAMPLE_PREFIX) else str(urdf)
-        return Located(spec, urdf, source, base, spec.name or robot, urdf.parent)
+        name = spec.name or robot
+        files = RobotFiles(urdf, _srdf_path(spec, options, base), tuple(_package_folders(spec, options, base, name)))
+        return Located(spec, files, source, name, urdf.parent)
     if robot.startswith(EXAMPLE_PREFIX):
-        files = CollectedRobot(resolve_path(robot, Path()))
+        stored = CollectedRobot(resolve_path(robot, Path()))
     elif robot.startswith(COLLECTIONS):
-        files = collected(robot)
+        stored = collected(robot)
     elif names_a_path(robot, Path()):
-        files = CollectedRobot(Path(robot).expanduser())
+        stored = CollectedRobot(Path(robot).expanduser())
     else:
         raise RobotNotFound(robot, [*known_robots(), *names_with(robot)], hint="(or give a path to a URDF or MJCF)")
-    home = files.path.parent
+    urdf = stored.path
+    home = urdf.parent
     config = Path(options.config) if options.config else home / "robot.toml"
     if options.config or (os.path.isfile(config) and not robot.startswith(COLLECTIONS)):
         spec, base = read_spec(config), config.parent
     else:
         spec, base = RobotSpec(), home
-    folders = (*spec.model.package_dirs, *files.folders)
-    spec = replace(spec, model=replace(spec.model, package_dirs=folders, srdf=spec.model.srdf or files.srdf))
-    urdf = files.path
     if os.path.exists(urdf) and not (os.path.isfile(urdf) or os.path.isdir(urdf)):
         fault = "is a pipe or a device, which cannot be read more than once"
         raise UrdfError(fault, where=str(urdf), hint="write its content into a file")
+    folders = tuple(_package_folders(spec, options, base, spec.name or urdf.stem, *stored.folders))
     if urdf.suffix == ".xacro":
-        arguments = {**files.arguments, **spec.model.xacro_args, **(options.xacro_arg or {})}
-        urdf = expand_xacro(urdf, arguments, _package_folders(spec, options, base), files.packages)
+        arguments = {**stored.arguments, **spec.model.xacro_args, **(options.xacro_arg or {})}
+        urdf = expand_xacro(urdf, arguments, folders, stored.packages)
     else:
         _check_arguments(options, str(urdf))
-    return Located(spec, urdf, robot, base, spec.name or urdf.stem, home)
+    files = RobotFiles(urdf, _srdf_path(spec, options, base, stored.srdf), folders)
+    return Located(spec, files, robot, spec.name or urdf.stem, home)
 
 
 def _check_arguments(options: LoadOptions, robot: str) -> None:
@@ -221,16 +210,23 @@ def _check_arguments(options: LoadOptions, robot: str) -> None:
         raise InputError("is not a xacro file", where=robot, hint="leave `xacro_arg` out")
 
 
-def _package_folders(spec: RobotSpec, options: LoadOptions, base: Path) -> tuple[Path, ...]:
-    """Return the folders in which ``package://`` paths are searched: stated folders, and ``ROS_PACKAGE_PATH``."""
-    ros = [folder for folder in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if folder]
-    stated = (base / Path(folder).expanduser() for folder in spec.model.package_dirs)
-    return *(Path(folder).expanduser() for folder in options.package_dir), *stated, *map(Path, ros)
+def _package_folders(spec: RobotSpec, options: LoadOptions, base: Path, name: str, *more: Path) -> Iterator[Path]:
+    """Yield the folders in which ``package://`` paths are searched: stated ones, ``more``, and ``ROS_PACKAGE_PATH``."""
+    ours = (spec.model.package_dirs, base, f"{name} robot.toml [model] package_dirs")
+    for folders, start, where in (options.package_dir, Path(), "package_dir"), ours:
+        for folder in folders:
+            path = start / Path(folder).expanduser()
+            if not os.path.isdir(path):
+                siblings = sorted(str(Path(folder).with_name(p.name)) for p in path.parent.glob("*") if p.is_dir())
+                raise PackageNotFound(folder, siblings, where=where, hint="name an existing folder")
+            yield path
+    yield from more
+    yield from (Path(folder) for folder in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if folder)
 
 
-def _srdf_path(spec: RobotSpec, options: LoadOptions, base: Path) -> Path | None:
+def _srdf_path(spec: RobotSpec, options: LoadOptions, base: Path, stored: str | None = None) -> Path | None:
     """Return the SRDF of a robot, or ``None``; raise ``UrdfError`` if the file is absent."""
-    text = options.srdf or spec.model.srdf
+    text = options.srdf or spec.model.srdf or stored
     if text is None:
         return None
     path = resolve_path(text, Path() if options.srdf else base)

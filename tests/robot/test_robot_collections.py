@@ -12,7 +12,7 @@ from impact_posture.config.problem_settings import LoadOptions
 from impact_posture.draft.draft import write_draft
 from impact_posture.errors import InputError, RobotNotFound
 from impact_posture.robot.robot_collections import ways_to_name
-from impact_posture.robot.robot_loader import load_robot, locate
+from impact_posture.robot.robot_loader import load_robot
 from impact_posture.system.progress import listening
 from tests.support.mjcfs import ARM, QUADRUPED
 
@@ -109,8 +109,7 @@ def test_download_fails(packages: Path) -> None:
 def test_robot_descriptions(packages: Path, capsys: pytest.CaptureFixture[str]) -> None:
     robot = load_robot("robot_descriptions:two_description")
     assert (robot.name, robot.nv, robot.default_posture) == ("two", 1, "ready")
-    folders = locate("robot_descriptions:two_description", LoadOptions()).spec.model.package_dirs
-    assert str(packages / "robot_descriptions/repository") in folders
+    assert robot.files is not None and packages / "robot_descriptions/repository" in robot.files.folders
     with pytest.raises(RobotNotFound, match="no robot 'two'; did you mean two_description"):
         load_robot("robot_descriptions:two")
     pytest.importorskip("mujoco")
