@@ -161,57 +161,53 @@ def locate(robot: str, options: LoadOptions) -> Located:
     """Find the files of a robot by name, path or URI."""
     shipped = robots_data() / robot / "robot.toml"
     if "/" not in robot and os.path.isfile(shipped):
-        _check_arguments(options, robot)
         spec, base = read_spec(shipped), shipped.parent
         text = spec.model.urdf or ""
         source = text if text.startswith(EXAMPLE_PREFIX) else f"impact-posture:{robot}/{text}"
-        urdf = resolve_path(text, base)
+        stored = CollectedRobot(resolve_path(text, base))
         if options.config:
             # The robot.toml of this package provides the values that the user's file leaves out.
             spec, base = read_spec(Path(options.config), over=shipped), Path(options.config).parent
             chosen = resolve_path(spec.model.urdf or text, base)
-            if chosen != urdf:
-                urdf = chosen
-                source = text if (text := spec.model.urdf or "").startswith(EXAMPLE_PREFIX) else str(urdf)
+            if chosen != stored.path:
+                stored = CollectedRobot(chosen)
+                source = text if (text := spec.model.urdf or "").startswith(EXAMPLE_PREFIX) else str(chosen)
         name = spec.name or robot
-        files = RobotFiles(urdf, _srdf_path(spec, options, base), tuple(_package_folders(spec, options, base, name)))
-        return Located(spec, files, source, name, urdf.parent)
-    if robot.startswith(EXAMPLE_PREFIX):
-        stored = CollectedRobot(resolve_path(robot, Path()))
-    elif robot.startswith(COLLECTIONS):
-        stored = collected(robot)
-    elif names_a_path(robot, Path()):
-        stored = CollectedRobot(Path(robot).expanduser())
     else:
-        raise RobotNotFound(robot, [*known_robots(), *names_with(robot)], hint="(or give a path to a URDF or MJCF)")
+        stored, source = _stored(robot), robot
+        config = Path(options.config) if options.config else stored.path.parent / "robot.toml"
+        if options.config or (os.path.isfile(config) and not robot.startswith(COLLECTIONS)):
+            spec, base = read_spec(config), config.parent
+        else:
+            spec, base = RobotSpec(), stored.path.parent
+        name = spec.name or ""
     urdf = stored.path
-    home = urdf.parent
-    config = Path(options.config) if options.config else home / "robot.toml"
-    if options.config or (os.path.isfile(config) and not robot.startswith(COLLECTIONS)):
-        spec, base = read_spec(config), config.parent
-    else:
-        spec, base = RobotSpec(), home
     if os.path.exists(urdf) and not (os.path.isfile(urdf) or os.path.isdir(urdf)):
         fault = "is a pipe or a device, which cannot be read more than once"
         raise UrdfError(fault, where=str(urdf), hint="write its content into a file")
-    folders = tuple(_package_folders(spec, options, base, spec.name or urdf.stem, *stored.folders))
+    folders = tuple(_package_folders(spec, options, base, name or urdf.stem, *stored.folders))
     if urdf.suffix == ".xacro":
         arguments = {**stored.arguments, **spec.model.xacro_args, **(options.xacro_arg or {})}
         urdf = expand_xacro(urdf, arguments, folders, stored.packages)
-    else:
-        _check_arguments(options, str(urdf))
-    files = RobotFiles(urdf, _srdf_path(spec, options, base, stored.srdf), folders)
-    return Located(spec, files, robot, spec.name or urdf.stem, home)
-
-
-def _check_arguments(options: LoadOptions, robot: str) -> None:
-    """Raise an error for arguments of a robot that is not a xacro file."""
-    if options.xacro_arg:
+    elif options.xacro_arg:
         raise InputError("is not a xacro file", where=robot, hint="leave `xacro_arg` out")
+    files = RobotFiles(urdf, _srdf_path(spec, options, base, stored.srdf), folders)
+    return Located(spec, files, source, name or urdf.stem, stored.path.parent)
+
+
+def _stored(robot: str) -> CollectedRobot:
+    """Return the files of a robot that is not a known name."""
+    if robot.startswith(EXAMPLE_PREFIX):
+        return CollectedRobot(resolve_path(robot, Path()))
+    if robot.startswith(COLLECTIONS):
+        return collected(robot)
+    if names_a_path(robot, Path()):
+        return CollectedRobot(Path(robot).expanduser())
+    raise RobotNotFound(robot, [*known_robots(), *names_with(robot)], hint="(or give a path to a URDF or MJCF)")
 
 
 def _package_folders(spec: RobotSpec, options: LoadOptions, base: Path, name: str, *more: Path) -> Iterator[Path]:
-    """Yield the folders in which ``package://`` paths are searched: stated ones, ``more``, and ``ROS_PACKAGE_PATH``."""
+    """Yield the folders for ``package://`` paths: stated folders, ``more``, and ``ROS_PACKAGE_PATH``."""
     ours = (spec.model.package_dirs, base, f"{name} robot.toml [model] package_dirs")
     for folders, start, where in (options.package_dir, Path(), "package_dir"), ours:
         for folder in folders:
@@ -224,7 +220,7 @@ def _package_folders(spec: RobotSpec, options: LoadOptions, base: Path, name: st
     yield from (Path(folder) for folder in os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep) if folder)
 
 
-def _srdf_path(spec: RobotSpec, options: LoadOptions, base: Path, stored: str | None = None) -> Path | None:
+def _srdf_path(spec: RobotSpec, options: LoadOptions, base: Path, stored: str | None) -> Path | None:
     """Return the SRDF of a robot, or ``None``; raise ``UrdfError`` if the file is absent."""
     text = options.srdf or spec.model.srdf or stored
     if text is None:
