@@ -69,10 +69,8 @@ def early_touches(
 
 def sunken_feet(robot: Robot, supports: Sequence[Support], q: Array) -> list[str]:
     """Return a warning for each foot that reaches more than :data:`BEYOND` below its contact point at ``q``."""
-    warnings = []
-    for touch in early_touches(
-        robot, [ImpactContact(s.frame, (0.0, 0.0, 1.0), offset=s.offset) for s in supports], q
-    ):
+    down, warnings = [ImpactContact(s.frame, (0.0, 0.0, 1.0), offset=s.offset) for s in supports], []
+    for touch in early_touches(robot, down, q):
         below = f"{1e3 * touch.front.reach:.0f} mm below the contact point of the foot {touch.contact.frame}"
         hint = f"give robot.toml [[supports]] offset = [{touch.offset.replace(' ', ', ')}]"
         warnings.append(f"{touch.front.link} reaches {below}, so it is in the ground: {hint}")

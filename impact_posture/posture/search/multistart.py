@@ -14,6 +14,7 @@ from impact_posture.config.problem_settings import STARTS
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import SolverFailed
+from impact_posture.posture.manifold.feasible_start import FEASIBLE
 from impact_posture.posture.program.certificate import Certificate
 from impact_posture.posture.program.compiled_solver import CompileMode
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem, equality_jacobian, rank
@@ -282,8 +283,9 @@ def _failure(problem: ConstrainedProblem, runs: list[SolverRun]) -> SolverFailed
     nearest = min((certificate for _, certificate in solved), key=lambda c: c.stationarity)
     fault = f"none of {len(solved)} feasible starts ended at a certified posture"
     hint = "try more `starts`, another `seed` or `posture`, or a small `regularization`"
-    # The starts satisfy the constraints to 1e-8.  The final postures may violate them, and are then less singular.
-    singular = singular_target(problem, [run.start for run in runs if run.start is not None])
+    # A posture that violates the constraints may be less singular than all that satisfy them.
+    held = [record.q for record, certificate in solved if certificate.primal <= FEASIBLE]
+    singular = singular_target(problem, [*held, *(run.start for run in runs if run.start is not None)])
     if singular is not None:
         return SolverFailed(f"{fault}: {singular.fact}", where="solver", hint=singular.hint)
     numbers = f"best stationarity {nearest.stationarity:.1e}, violation {nearest.primal:.1e}"
