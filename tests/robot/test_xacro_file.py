@@ -74,6 +74,8 @@ def test_defaults_and_arguments(arm: str) -> None:
     assert [shape.link for shape in shapes.shapes] == ["one", "hand"] and not shapes.warnings
     shutil.move(Path(arm).parent / "below", Path(arm).parents[1])
     assert not read_shapes(load_robot(arm)).warnings
+    Path(arm).unlink()  # Shapes come from the expanded file.
+    assert read_shapes(plain).described == ["one"]
 
 
 def test_robot_toml_beside_the_xacro_file_is_read(arm: str) -> None:
