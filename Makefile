@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 JOBS ?= 2
 
-.PHONY: help demo test coverage wheel test-wheel lowest lint types docs bench bench-gpu study-impacts study-elastic study-global study-feasible study-flow study-robustness study-real-impacts study-verdict study-robots study-scan study-controller study-sweep reproduction calibration regression
+.PHONY: help demo test coverage wheel test-wheel lowest lint types docs bench bench-gpu study-impacts study-elastic study-global study-feasible study-flow study-robustness study-real-impacts study-verdict study-robots study-scan study-controller study-sweep study-hostile reproduction calibration regression
 .PHONY: pictures viewer clean
 
 help:
@@ -31,6 +31,7 @@ help:
 	@echo "make study-scan     scan postures of an arm and of a humanoid, and draw the results"
 	@echo "make study-controller  compare the controllers in C and Python: equal answers, growth of memory, times (an hour; PART=equality, growth or times runs one part; times needs 4 minutes on a quiet machine)"
 	@echo "make study-sweep    measure the robustness (killed workers and parents, MPI, Slurm jobs) and the speed of sweeps"
+	@echo "make study-hostile  try hostile inputs at length, and count them by test file (an hour)"
 	@echo "make calibration    measure the restitution of the contact laws in the simulated world"
 	@echo "make regression  recompute the committed reference results"
 	@echo "make pictures    draw the pictures of the documentation"
@@ -125,6 +126,9 @@ study-controller: $(VENV)/.installed-test
 study-sweep: $(VENV)/.installed-test
 	$(BIN)/python -m docs.studies.sweep
 	$(BIN)/python -m docs.studies.sweep_verdicts
+
+study-hostile: $(VENV)/.installed-test
+	$(BIN)/python -m pytest tests/hostile -n $(JOBS) --dist worksteal -q --hostile-full --hostile-table
 
 reproduction: $(VENV)/.installed-test
 	$(BIN)/python -m docs.studies reproduction --write

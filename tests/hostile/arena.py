@@ -1,4 +1,4 @@
-"""Run a command line in a fork of this process, which has imported all modules, and assess the result."""
+"""Run a command line in a fork of this process, which has imported all modules, and assess and count the results."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import shlex
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterable
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -72,8 +72,39 @@ class Outcome:
         return complaints
 
 
+@dataclass
+class Tally:
+    """Number of inputs that the running test has tried, and number of inputs with a complaint."""
+
+    tried: int = 0
+    mishandled: int = 0
+
+
+TALLY = Tally()
+
+
+@contextmanager
+def judging() -> Iterator[Callable[[str, Sequence[str]], None]]:
+    """Yield a function that counts an input with its list of complaints; fail at the end with all complaints."""
+    failures, before = [], TALLY.tried
+
+    def judge(case: str, complaints: Sequence[str]) -> None:
+        TALLY.tried += 1
+        if complaints:
+            TALLY.mishandled += 1
+            failures.append(f"{case}\n    {'; '.join(complaints)}")
+
+    yield judge
+    assert not failures, f"{len(failures)} of {TALLY.tried - before}:\n" + "\n".join(failures)
+
+
 def strike(folder: Path, *argv: str) -> Outcome:
-    """Run a command line in a folder and return the outcome."""
+    """Run and count a command line in a folder, and return the outcome."""
+    TALLY.tried += 1
+    return _strike(folder, argv)
+
+
+def _strike(folder: Path, argv: tuple[str, ...]) -> Outcome:
     before = _content(folder)
     streams = [os.memfd_create(name) for name in ("out", "err")]
     child = os.fork()
@@ -94,15 +125,14 @@ def attack(
     cases: Iterable[tuple[str, ...]], folder: Path, arrange: Callable[[int], object] = lambda k: None
 ) -> list[Outcome]:
     """Run all command lines, each after ``arrange(k)``; fail with a list of all complaints."""
-    outcomes, failures = [], []
-    for k, argv in enumerate(cases):
-        arrange(k)
-        outcome = strike(folder, *argv)
-        outcomes.append(outcome)
-        if outcome.complaints:
+    outcomes = []
+    with judging() as judge:
+        for k, argv in enumerate(cases):
+            arrange(k)
+            outcome = _strike(folder, argv)
+            outcomes.append(outcome)
             words = outcome.err.strip()[-300:]
-            failures.append(f"case {k}: {shlex.join(argv)[:300]!a}\n    {'; '.join(outcome.complaints)}: {words!a}")
-    assert not failures, f"{len(failures)} of {len(outcomes)}:\n" + "\n".join(failures)
+            judge(f"case {k}: {shlex.join(argv)[:300]!a}, {words!a}", outcome.complaints)
     return outcomes
 
 

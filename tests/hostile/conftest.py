@@ -1,12 +1,71 @@
-"""Return a folder for attacks, with a small robot and a file that no command may change."""
+"""A folder for attacks, and the count of the inputs that the hostile tests try.
+
+A test counts the inputs that it gives to ``strike``, ``attack`` or ``judging``; a test without these counts as one
+input.  A failing test has at least one mishandled input.  ``--hostile-table`` writes the counts into
+docs/generated/hostile.md.
+"""
 
 from __future__ import annotations
 
+from collections import defaultdict
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from tests.hostile.arena import SMALL, strike
+from tests.hostile.arena import SMALL, TALLY, strike
+
+PAGE = Path(__file__).parents[2] / "docs" / "generated" / "hostile.md"
+HEAD = "<!-- Written by `make study-hostile`; do not edit. -->"
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--hostile-table", action="store_true", help=f"write {PAGE.name} from the counts of this run")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
+    TALLY.tried = TALLY.mishandled = 0
+    return (yield)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Iterator[None]:
+    report = yield
+    if report.failed or (report.passed and report.when == "call"):
+        tried, mishandled = (TALLY.tried, TALLY.mishandled) if report.when == "call" else (1, 1)
+        about = (item.module.__doc__ or "").partition("\n")[0]
+        report.user_properties.append(("hostile", [about, max(1, tried), max(int(report.failed), mishandled)]))
+    return report
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    reports = [report for reports in terminalreporter.stats.values() for report in reports]
+    lines = table([report for report in reports if isinstance(report, pytest.TestReport)])
+    if lines:
+        terminalreporter.line(f"hostile inputs {lines[-1]}")
+    if config.getoption("--hostile-table", default=False):
+        PAGE.write_text("\n".join([HEAD, "", *lines, ""]), encoding="utf-8")
+
+
+def table(reports: list[pytest.TestReport]) -> list[str]:
+    """Return the lines of the page: skipped tests, and the tried and mishandled inputs of each test file."""
+    abouts: dict[str, str] = {}
+    counts: dict[str, list[int]] = defaultdict(lambda: [0, 0])
+    for report in reports:
+        name = Path(report.location[0]).stem.removeprefix("test_").replace("_", " ")
+        for about, tried, mishandled in (value for key, value in report.user_properties if key == "hostile"):
+            abouts[name] = about.rstrip(".")
+            counts[name] = [counts[name][0] + tried, counts[name][1] + mishandled]
+    if not counts:
+        return []
+    skips = [report for report in reports if report.skipped and "hostile/" in report.nodeid]
+    reasons = sorted({str(report.longrepr[2]).removeprefix("Skipped: ") for report in skips if report.longrepr})
+    lines = [f"Skipped: {'; '.join(reasons)}.", ""] if reasons else []
+    lines += ["| inputs | what is tested | tried | mishandled |", "|---|---|---|---|"]
+    lines += [f"| {name} | {abouts[name]} | {counts[name][0]} | {counts[name][1]} |" for name in sorted(counts)]
+    tried, mishandled = (sum(column) for column in zip(*counts.values(), strict=True))
+    return [*lines, f"| all | | {tried} | {mishandled} |"]
 
 
 @pytest.fixture(scope="session")
