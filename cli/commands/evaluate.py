@@ -76,7 +76,8 @@ def _scalars(page: Page, impact: ResolvedImpact, evaluation: Evaluation) -> None
     values = ("standing", "free") if len(shown) > 1 else ("value",)
     page.table(("", *values, "unit", "meaning"), rows, right=tuple(range(1, 1 + len(values))))
     letters = {"impulse": f"λ̄²H, λ̄ = {impact.contact.impulse:g} N·s", "speed": "V", "sticking": "S", "energy": "E"}
-    letters["coulomb"] = f"C, μ = {impact.contact.friction:g}"
+    for name, symbol in (("coulomb", "C"), ("effective-mass", "m in kg")):
+        letters[name] = f"{symbol}, μ = {impact.contact.friction:g}"
     kind = impact.objective.kind
     if impact.objective.others:
         letters["impulse"] = "the largest ‖Δν‖² within the bounds on the impulses"

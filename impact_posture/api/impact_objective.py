@@ -52,11 +52,11 @@ class ImpactObjective(WorstCaseObjective):
             offset that robot.toml has for its frame.
         metric: Norm of the velocity jump: ``euclidean``, ``kinetic`` or ``weighted``, or a
             :class:`~impact_posture.impact.metric.Metric`.
-        kind: Minimized quantity: ``impulse`` (λ̄²H), ``speed`` (V), ``sticking`` (S), ``coulomb`` (C) or ``energy``
-            (E).  λ̄ is the largest impulse of the contact, and ``docs/notation.md`` defines the other symbols.
-            ``None`` selects ``impulse``.  But if the contact states its friction, ``None`` selects the same quantity
-            as ``--objective auto`` on the command line.  A :class:`PostureProblem` that states the speed or the
-            elasticity of the contact also does this.
+        kind: Minimized quantity: ``impulse`` (λ̄²H), ``speed`` (V), ``sticking`` (S), ``coulomb`` (C), ``energy``
+            (E) or ``effective-mass`` (m).  λ̄ is the largest impulse of the contact, and ``docs/notation.md`` defines
+            the other symbols.  ``None`` selects ``impulse``.  But if the contact states its friction, ``None``
+            selects the same quantity as ``--objective auto`` on the command line.  A :class:`PostureProblem` that
+            states the speed or the elasticity of the contact also does this.
         supports: Feet that stay in place during the impact, as ``FRAME[:point|surface]``; ``None`` selects the feet
             of robot.toml, ``()`` selects no feet.
         compliance: Compliance ε of the supports, 1/kg; 0 selects 1e-4 divided by the mass of the robot.
@@ -136,6 +136,20 @@ class ImpactObjective(WorstCaseObjective):
     def evaluate(self, q: ArrayLike, speed: float = SPEED, restitution: float = RESTITUTION) -> Evaluation:
         """Compute H, G, V, S, E, the impact ellipsoid and the predicted velocity jump at ``q``."""
         return evaluate(self, self.robot.check_posture(np.asarray(q, dtype=float), limits=False), speed, restitution)
+
+    @checked
+    def value_and_gradient(self, q: ArrayLike) -> tuple[float, Array]:
+        """Return this objective and its tangent gradient at ``q``, as :meth:`ImpactGradient.objective` does.
+
+        The gradient has shape (nv,): entry i is the derivative along ``ν_i``.  For a floating base, the first six
+        entries belong to the linear and angular velocity of the base in base axes, and not to entries of ``q``.
+
+        Raises:
+            PostureError: ``q`` has the wrong shape, is not finite, or has a quaternion of zero norm.
+            MetricError: The objective does not exist at ``q``.
+        """
+        at = self.robot.check_posture(np.asarray(q, dtype=float), limits=False)
+        return self.value(at), self.gradient(at)
 
     @checked
     def export(self, out: str | Path, *, build: bool = True, **options: Any) -> Export:

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from impact_posture.path.posture_path import PosturePath
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class PostureResult:
     """Optimized posture with its certificate.  The result can be saved, drawn and exported.
 
@@ -84,6 +84,30 @@ class PostureResult:
     def certificate(self) -> Certificate:
         """Stationarity, violation and multipliers, recomputed with Pinocchio."""
         return self.solution.certificate
+
+    @property
+    def verdict(self) -> str:
+        """The first line that ``optimize`` prints; ``document["verdict"]`` has its numbers.
+
+        Raises:
+            InputError: The objective is not an impact objective.
+        """
+        return str(self.document["verdict"]["line"])
+
+    def __repr__(self) -> str:
+        objective = self.problem.problem.objective
+        values = " → ".join(f"{objective.value(q):.4g}" for q in (self.initial, self.q))
+        kept = "certified" if self.certificate.holds() else "not certified"
+        return f"PostureResult({objective.robot.name}, {objective.name} {values} ({-self.reduction:+.1%}), {kept})"
+
+    def _repr_html_(self) -> str | None:
+        """Return the postures, the verdict and the table of values for notebooks."""
+        if self.problem.prepared is None:
+            return None
+        from impact_posture.output.report.result_report import result_summary
+
+        view = result_view(self._prepared, self._postures, self.motion)
+        return result_summary(self._prepared, view, self.document)
 
     @cached_property
     def document(self) -> dict[str, Any]:

@@ -209,7 +209,7 @@ def _worst_note(objective: WorstCaseObjective) -> str:
         note = "; the worst of " + "; ".join(model.name for model in objective.model_variants)
     if objective.normal_cone_deg or objective.model_variants:
         note += ".  If several normals or models have the largest value, grad is the subgradient for one of them"
-    if objective.kind == "coulomb":
+    if objective.impact_kind.kink:
         note += f", friction {objective.contact.friction:.9g}; {objective.impact_kind.kink}"
     return note
 

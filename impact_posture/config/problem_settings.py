@@ -45,7 +45,7 @@ Root = Literal["free-flyer", "fixed"]
 NormalFrame = Literal["world", "contact"]
 ContactPoint = Literal["frame", "front"]
 MetricKind = Literal["euclidean", "kinetic", "weighted"]
-ObjectiveKind = Literal["impulse", "speed", "sticking", "coulomb", "energy"]
+ObjectiveKind = Literal["impulse", "speed", "sticking", "coulomb", "energy", "effective-mass"]
 ObjectiveChoice = Literal[ObjectiveKind, "auto"]
 ContactPose = Literal["full", "position", "aligned", "free", "box"]
 BaseMode = Literal["free", "level", "fixed", "box"]
@@ -165,7 +165,7 @@ class ImpactSettings(RobotSettings):
         "FILE|velocity-limits",
     )
     objective: ObjectiveChoice | None = setting(
-        None, "Minimize H (impulse), V (speed), S (sticking), C (coulomb) or E (energy).", METRIC,
+        None, "Minimize H (impulse), V (speed), S (sticking), C (coulomb), E (energy) or m (effective-mass).", METRIC,
         words="auto with --speed, --friction or a contact's elasticity, else impulse",
     )  # fmt: skip
     joint_model: JointModel = setting(

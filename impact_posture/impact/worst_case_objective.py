@@ -34,7 +34,7 @@ from impact_posture.system.arrays import Array
 @checked
 @dataclass(frozen=True)
 class WorstCaseObjective:
-    """Worst case of ``λ̄²H`` (impulse), ``V`` (speed), ``S`` (sticking), ``C`` (coulomb) or ``E`` (energy).
+    """Worst case of the objective type :attr:`kind`: ``λ̄²H``, ``V``, ``S``, ``C``, ``E`` or ``m``.
 
     ``λ̄`` is the largest impulse of the contact along the normal.  The class implements the
     :class:`~impact_posture.impact.objective.Objective` protocol for every combination of an objective type
@@ -45,7 +45,7 @@ class WorstCaseObjective:
         robot: The robot.
         contact: Point and normal of the first contact.
         metric: Weight matrix ``W`` in the squared norm of the velocity jump.
-        kind: Objective type: ``impulse``, ``speed``, ``sticking``, ``coulomb`` or ``energy``.
+        kind: Objective type: ``impulse``, ``speed``, ``sticking``, ``coulomb``, ``energy`` or ``effective-mass``.
         supports: Feet that stay on the ground.
         compliance: Compliance ε of the supports, 1/kg; zero selects the default.
         normal_cone_deg: Half angle of the cone of possible normals, degrees; 0 if only the normal of the contact is
@@ -217,7 +217,7 @@ class WorstCaseObjective:
         """Return the objective at ``q``, computed with Pinocchio.
 
         Raises:
-            MetricError: The objective type is ``sticking`` or ``coulomb`` and has no value at ``q``.
+            MetricError: The objective type, such as ``sticking`` or ``coulomb``, has no value at ``q``.
         """
         return self.worst_case.value(q)
 

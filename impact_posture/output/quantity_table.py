@@ -49,7 +49,7 @@ def quantity_rows(impact: ResolvedImpact, initial: dict[str, Any], optimal: dict
     """
     named = quantities(impact.metric)
     kind, per_speed = impact.objective.kind, named[2][1]
-    unit = {"impulse": "jump²", "energy": "kg"}.get(kind, per_speed)
+    unit = {"impulse": "jump²", "energy": "kg", "effective-mass": "kg"}.get(kind, per_speed)
     named.insert(0, ("objective", unit, f"what was minimized ({kind})"))
     rows = _felt_rows(impact, initial, optimal) if impact.speed else []
     first, last = (block.get("attainable_speed") for block in (initial, optimal))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import re
 import subprocess
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 import impact_posture as ip
@@ -263,6 +265,33 @@ def test_the_shown_lines_run(page: str, tmp_path: Path) -> None:
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "out" / "result.json").is_file() and "Certificate" in done.stdout
+
+
+def test_a_result_describes_itself(result: ip.PostureResult) -> None:
+    before, after = (result.document[key]["objective"] for key in ("initial", "optimal"))
+    assert repr(result) == f"PostureResult(tilthex_arm, impulse {before:.4g} → {after:.4g} (-65.9%), certified)"
+    assert result.verdict == result.document["verdict"]["line"] and result.verdict.startswith("verdict: ")
+    page = result._repr_html_()
+    assert page is not None and page.count("<img") == 1 and "<script" not in page
+    picture = base64.b64decode(re.findall(r'src="data:image/png;base64,([^"]+)"', page)[0])
+    assert picture.startswith(b"\x89PNG") and result.verdict.split(".")[0] in page
+    cells = re.findall(r'<th scope="row">H</th><td>([^<]+)</td><td>([^<]+)</td>', page)
+    assert [float(cell) for cell in cells[0]] == pytest.approx([before, after], rel=5e-3)
+
+
+def test_value_and_gradient_equal_differences_and_the_oracle() -> None:
+    objective = arm(kind="effective-mass")
+    model, q = objective.robot.model, objective.robot.posture()
+    value, gradient = objective.value_and_gradient(list(q))
+    assert value == objective.evaluate(q).contact_mass == objective.evaluate(q).objective
+    steps = 1e-5 * np.eye(model.nv)
+    slopes = [
+        (objective.value(pin.integrate(model, q, d)) - objective.value(pin.integrate(model, q, -d))) / 2e-5
+        for d in steps
+    ]
+    np.testing.assert_allclose(gradient, slopes, rtol=0, atol=1e-6 * np.abs(gradient).max())
+    with pytest.raises(PostureError):
+        objective.value_and_gradient([0.0])
 
 
 def test_the_friction_of_the_contact_is_saved(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from impact_posture.config.problem_settings import ImpactSettings
 from impact_posture.config.text_parsers import parse_armature, parse_contact
-from impact_posture.errors import ContactError, FrameNotFound, InputError
+from impact_posture.errors import ContactError, FrameNotFound, InputError, MetricError
 from impact_posture.impact.evaluation.ellipsoids import classical_ellipsoids, ellipsoid_of, force_ellipsoid
 from impact_posture.impact.evaluation.evaluation import Evaluation, evaluate
 from impact_posture.impact.evaluation.impact_effect import tangent_units
@@ -194,6 +194,14 @@ def test_where_the_contact_cannot_move_along_the_normal(planar: str) -> None:
     assert evaluation.frictionless is None and evaluation.energy_loss is None
     assert evaluation.scalars.H == pytest.approx(0.0, abs=1e-20)
     assert any("unbounded" in line for line in evaluation.warnings)
+
+
+def test_effective_mass_where_the_contact_cannot_move(planar: str) -> None:
+    settings = ImpactSettings(robot=planar, frame="tip", normal=(0.0, 0.0, 1.0), objective="effective-mass")
+    impact = resolve(settings)
+    assert strict(evaluate(impact.objective, np.array([0.3, 0.9])))["objective"] is None
+    with pytest.raises(MetricError, match="unbounded"):
+        impact.objective.value(np.array([0.3, 0.9]))
 
 
 def test_one_joint_dominates_or_none_does(planar: str) -> None:

@@ -13,7 +13,6 @@ from docs.studies.verdict.impact_simulation import ImpactSimulation, Point, Simu
 from impact_posture.config.problem_settings import ProblemSettings
 from impact_posture.config.table_validation import validate
 from impact_posture.dynamics.numeric import Numeric
-from impact_posture.impact.effective_mass_objective import EffectiveMassObjective
 from impact_posture.impact.elasticity.contact_compression import ContactStiffness, compression
 from impact_posture.impact.friction.coulomb_impact import coulomb_impact
 from impact_posture.impact.impact_contact import ImpactContact, point_on
@@ -100,8 +99,13 @@ def test_gradients_of_mass_and_jumps_equal_differences(name: str, friction: floa
     assert value[0] == coulomb_impact(objective.oracle, q).mass
     measured = central_gradient(lambda q: bounds.value(numeric.at(q)), objective.robot.model, q, 1e-4)
     assert relative(jacobian, measured) < 1e-5
-    least = EffectiveMassObjective.of(objective)
-    assert relative(least.gradient(q), measured[0]) < 1e-5 and least.value(q) == value[0]
+    mass = replace(objective, kind="effective-mass")
+    assert relative(mass.gradient(q), measured[0]) < 1e-5 and mass.value(q) == value[0]
+    expressed, gradient = (np.array(v).ravel() for v in mass.gradient_fun()(q, objective.contact.normal))
+    assert relative(expressed, value[:1]) < 1e-9 and relative(gradient, mass.gradient(q)) < 1e-8
+    # The mass of the literature is the inverse of the mobility along the normal; friction never makes it smaller.
+    G = objective.oracle.quantities(q).G
+    assert value[0] * G == pytest.approx(1) if friction == 0 else value[0] * G > 1
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.1, 0.7])

@@ -173,7 +173,7 @@ def test_lifted_form(name: str) -> None:
                 assert np.linalg.matrix_rank(np.array(system(at, contact.normal, guess)), tol=1e-12) == guess.size
 
 
-@pytest.mark.parametrize("kind", (*KINDS, "coulomb"))
+@pytest.mark.parametrize("kind", (*KINDS, "coulomb", "effective-mass"))
 @pytest.mark.parametrize("name", WHOLE)
 def test_objective_functions_agree_with_its_own_numbers(name: str, kind: ObjectiveKind) -> None:
     all_of_them = list(combinations(name))

@@ -175,6 +175,15 @@ def test_optimize_writes_friction_and_reads_it_again(tmp_path: Path) -> None:
     assert second["objective"] == pytest.approx(first["optimal"]["objective"], rel=1e-12)
 
 
+def test_evaluate_prints_the_effective_mass_as_the_objective() -> None:
+    argv = "evaluate panda --normal 0 0 1 --objective effective-mass --friction".split()
+    for friction in ("0", "0.3"):
+        told = json.loads(run(*argv, friction, "--json").stdout)["evaluation"]
+        assert told["objective"] == told["effective_mass_with_friction"]
+        assert (told["objective"] == pytest.approx(told["effective_mass"])) == (friction == "0")
+    assert f"objective effective-mass (m in kg, μ = 0.3): {told['objective']:.4g}" in run(*argv, "0.3").stdout
+
+
 def test_bad_input_gets_one_line() -> None:
     panda, hands = ("panda", "--normal", "0", "0", "1"), ("gripper_left_base_link", "gripper_right_base_link")
     both = [word for hand in hands for word in ("--contact", f"{hand}:-1,0,0")]

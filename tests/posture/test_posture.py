@@ -63,6 +63,7 @@ def walk(problem: ConstrainedProblem, q: np.ndarray, step: float, count: int) ->
         ("panda", (0, 0, 1), {}),
         ("panda", (1, 0, 0), {"metric": "weighted", "weights": "velocity-limits"}),
         ("xarm7", (0, 1, 1), {"objective": "energy"}),
+        ("xarm7", (0, 1, 1), {"objective": "effective-mass", "friction": 0.1}),
     ],
 )
 def test_no_posture_along_the_null_space_is_better(

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from impact_posture.errors import MetricError
+from impact_posture.impact.kinds.coulomb_kind import CoulombKind
 from impact_posture.impact.kinds.impact_kind import ImpactKind
 from impact_posture.impact.quantities.impact_quantities import Scalars
 from impact_posture.impact.quantities.sticking_point import SINGULAR
@@ -52,7 +53,7 @@ def objective_value(objective: WorstCaseObjective, q: Array) -> float | None:
     if objective.model_variants:
         values = [objective_value(member, q) for member in objective.by_variant]
         return None if None in values else max(v for v in values if v is not None)
-    if isinstance(objective.worst_case, ImpactKind) and objective.kind != "coulomb":
+    if isinstance(objective.worst_case, ImpactKind) and not isinstance(objective.worst_case, CoulombKind):
         scalars = Scalars.of(objective.oracle.quantities(q))
         alone: float | None = getattr(scalars, objective.impact_kind.symbol)
         return None if alone is None else objective.scale * alone

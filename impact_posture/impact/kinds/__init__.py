@@ -1,1 +1,1 @@
-"""The objective types ``impulse``, ``speed``, ``sticking``, ``coulomb`` and ``energy``, one class each."""
+"""The objective types: one class for each value of ``--objective``."""

@@ -37,7 +37,9 @@ class CoulombKind(ImpactKind):
     name, symbol = "coulomb", "C"
     units = "jump² per (m/s)² of approach, with friction"
     kink = "where the contact point begins to slip, grad is the gradient of sticking"
-    no_cone = "coulomb is not a quadratic form of the normal, so its exact worst case over a cone is not known"
+    no_cone = (
+        "the impact with friction is not a quadratic form of the normal, so its worst case over a cone is not known"
+    )
 
     def value(self, q: Array) -> float:
         jump = coulomb_impact(self.oracle, q).jump
@@ -67,13 +69,21 @@ class CoulombKind(ImpactKind):
         case, n = self.case, k.n
         if case.contact.friction <= NO_FRICTION:
             return k.V, k.grad_V
-        R = in_world(case, k.tree, ca.SX.eye(3))
-        B = R.T @ k.mobility @ R
-        direction, K = coulomb_direction(B, n, case.contact.friction)
-        x = k.respond([impact_at(case, direction / ca.dot(B @ n, direction))])
-        value = k.product(x, x)
-        r = -value * n - K @ (R.T @ k.adjoint_velocity(x) - value * (B @ n))
+        p, Bn, K = self.impulse(k)
+        x = k.respond([impact_at(case, p)])
+        value, R = k.product(x, x), in_world(case, k.tree, ca.SX.eye(3))
+        r = -value * n - K @ (R.T @ k.adjoint_velocity(x) - value * Bn)
         return value, k.size_gradient(x, impact_at(case, r))
+
+    def impulse(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX, ca.SX]:
+        """Return the impulse ``p`` per unit approach speed, ``Bn``, and the matrix ``K`` with ``∂w = K ∂B (n − w)``.
+
+        All three are in the axes ``normal_frame`` of the contact.  The friction must be above zero.
+        """
+        R = in_world(self.case, k.tree, ca.SX.eye(3))
+        B = R.T @ k.mobility @ R
+        direction, K = coulomb_direction(B, k.n, self.case.contact.friction)
+        return direction / ca.dot(B @ k.n, direction), B @ k.n, K
 
     def unknowns(self, tree: Tree, n: ca.SX, label: str = "") -> UnknownJump:
         """Return unknowns and equations for the velocity jump ``a`` that the impulse ``λ(n − μd)`` causes.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from impact_posture.config.problem_settings import ObjectiveKind
 from impact_posture.impact.kinds.coulomb_kind import CoulombKind
+from impact_posture.impact.kinds.effective_mass_kind import EffectiveMassKind
 from impact_posture.impact.kinds.energy_kind import EnergyKind
 from impact_posture.impact.kinds.impact_kind import ImpactKind
 from impact_posture.impact.kinds.impulse_kind import ImpulseKind
@@ -16,4 +17,5 @@ KINDS: dict[ObjectiveKind, type[ImpactKind]] = {
     "sticking": StickingKind,
     "coulomb": CoulombKind,
     "energy": EnergyKind,
+    "effective-mass": EffectiveMassKind,
 }

@@ -152,7 +152,7 @@ def objective_unit(view: ResultView) -> str:
     """Return the unit of the objective, which depends on the kind of objective and the metric."""
     jump = jump_unit(view)
     square = "J" if jump == "√J" else f"({jump})²" if "/" in jump and jump[0] != "(" else f"{jump}²"
-    return {"impulse": square, "energy": "kg"}.get(view.objective.kind, f"{square}/(m/s)²")
+    return {"impulse": square, "energy": "kg", "effective-mass": "kg"}.get(view.objective.kind, f"{square}/(m/s)²")
 
 
 def mixed_unit(robot: Robot) -> str:

@@ -77,12 +77,18 @@ def render(content: Content, scene: ReportScene, pictures: Sequence[tuple[str, s
     viewer, loader, style = ((_VIEWER / name).read_text(encoding="utf-8") for name in files)
     # In HTML, a script element ends at the first "</script", even within JSON text.
     data = packed.replace("<", "\\u003c")
-    text: str = _template().render(
+    text: str = _template("page").render(
         content=content, scene=scene, pictures=pictures, data=data, arrays=arrays, style=style, loader=loader,
         viewer=zipped(viewer.encode()), license=viewer.partition("*/")[0].partition("/*!")[2].strip(),
         version=__version__, charts=[_charts(track) for track in scene.tracks],
         hashes={"viewer": _hash(viewer), "loader": _hash(loader), "style": _hash(style)},
     )  # fmt: skip
+    return text
+
+
+def render_summary(verdict: Sequence[str], tables: Sequence[Table], pictures: Sequence[tuple[str, str]]) -> str:
+    """Return pictures, verdict and tables as HTML without a script.  All texts are escaped."""
+    text: str = _template("summary").render(content={"verdict": verdict, "tables": tables}, pictures=pictures)
     return text
 
 
@@ -103,7 +109,7 @@ def _hash(text: str) -> str:
 
 
 @cache
-def _template() -> Any:
+def _template(name: str) -> Any:
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
 
@@ -115,7 +121,7 @@ def _template() -> Any:
         loader=FileSystemLoader(_VIEWER), autoescape=True, undefined=StrictUndefined, finalize=shown,
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
-    return environment.get_template("page.html.jinja")
+    return environment.get_template(f"{name}.html.jinja")
 
 
 def _charts(track: Track) -> list[dict[str, Any]]:

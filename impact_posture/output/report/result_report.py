@@ -13,14 +13,16 @@ from impact_posture.impact.elasticity.contact_compression import contact_mass
 from impact_posture.impact.evaluation.coulomb_jump import coulomb_jump, coulomb_jumps
 from impact_posture.impact.evaluation.velocity_jump import normal_jump
 from impact_posture.impact.impact_contact import point_on
+from impact_posture.output.plot import draw_all
 from impact_posture.output.plot.result_view import ALONE, SEPARATOR, ResultView, header_lines, number
 from impact_posture.output.quantity_table import QuantityRow, answer_key, quantities, quantity_rows
 from impact_posture.output.report.drawn_robot import draw_robot
-from impact_posture.output.report.report_page import Content, Table, write_page
+from impact_posture.output.report.report_page import Content, Table, figures, render_summary, write_page
 from impact_posture.output.report.report_scene import Curve, ReportScene, Track, impact_curves
 from impact_posture.posture.formulation.problem_file import Prepared
 from impact_posture.system.arrays import Array
 from impact_posture.system.output_folder import typed_command
+from impact_posture.system.scratch_folder import scratch_folder
 
 # Maximum number of frames of a motion over time.
 _MOST = 121
@@ -45,6 +47,14 @@ def write_result_report(
     """
     scene = scene or result_scene(prepared, view, meshes)
     return write_page(folder, _content(folder, prepared, view, document), scene)
+
+
+def result_summary(prepared: Prepared, view: ResultView, document: dict[str, Any]) -> str:
+    """Return HTML for notebooks: the picture of the postures, the verdict, and the values before and after."""
+    with scratch_folder() as folder:
+        draw_all(view, folder, ("png",), ["postures"])
+        pictures = figures(folder)
+    return render_summary(_verdict(document), [*_before_and_after(prepared, document)], pictures)
 
 
 def result_scene(prepared: Prepared, view: ResultView, meshes: bool = False) -> ReportScene:
@@ -138,12 +148,7 @@ def _content(folder: Path, prepared: Prepared, view: ResultView, document: dict[
         title=title,
         command=typed_command(folder) or "impact-posture optimize problem.toml",
         facts=tuple(facts),
-        verdict=(
-            document["verdict"]["line"],
-            # Results of earlier versions do not have this line.
-            *filter(None, [document["verdict"].get("minimized")]),
-            *document["verdict"]["advice"],
-        ),
+        verdict=_verdict(document),
         tables=(
             *_before_and_after(prepared, document),
             Table(
@@ -163,6 +168,12 @@ def _content(folder: Path, prepared: Prepared, view: ResultView, document: dict[
         ),
         sources=(("problem.toml", (folder / "problem.toml").read_text(encoding="utf-8")),),
     )  # fmt: skip
+
+
+def _verdict(document: dict[str, Any]) -> tuple[str, ...]:
+    verdict = document["verdict"]
+    # Results of earlier versions do not have the second line.
+    return verdict["line"], *filter(None, [verdict.get("minimized")]), *verdict["advice"]
 
 
 def _before_and_after(prepared: Prepared, document: dict[str, Any]) -> Iterator[Table]:

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from impact_posture.errors import ImpactPostureError, Infeasible
-from impact_posture.impact.effective_mass_objective import EffectiveMassObjective
 from impact_posture.posture.formulation.build_problem import build_problem
 from impact_posture.posture.formulation.problem_file import Prepared
 from impact_posture.posture.program.compiled_solver import CompileMode
@@ -29,7 +28,7 @@ def least_effective_mass(
     For every contact stiffness, the posture with the least effective mass has the least peak force.  Arguments and
     errors are as in :func:`~impact_posture.posture.search.multistart.solve`.
     """
-    mass = EffectiveMassObjective.of(problem.impact)
+    mass = replace(problem.impact, kind="effective-mass", normal_cone_deg=0.0, others=(), model_variants=())
     lightest = replace(problem, objective=mass, requirements=replace(problem.requirements, regularization=0.0))
     return solve(lightest, starts=starts, seed=seed, jobs=jobs, compile=compile, guesses=guesses)
 

@@ -125,8 +125,8 @@ def _key(structure: Structure, objective: WorstCaseObjective | None) -> str:
     """
     robot = without_parameters(structure.robot)
     if objective is not None:
-        # The friction of the impact affects only the objective ``coulomb``.
-        friction = objective.contact.friction if objective.kind == "coulomb" else 0.0
+        # The friction of the impact affects only the objectives with a kink between sticking and sliding.
+        friction = objective.contact.friction if objective.impact_kind.kink else 0.0
         objective = replace(objective, robot=robot, contact=replace(objective.contact, friction=friction))
     points = [(robot.model.frames[robot.frame_id(point.frame)], point) for point in structure.points]
     content = [
