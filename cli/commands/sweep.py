@@ -87,6 +87,7 @@ def sweep(
         "solver_s": run.solver_s,
         "total_s": run.total_s,
         "wall_s": time.perf_counter() - began,
+        "damaged": list(run.damaged),
     }
     if json:
         print_json(document)
@@ -100,6 +101,7 @@ def sweep(
             f"{100 * run.solver_s / max(run.total_s, 1e-9):.0f} % of it in the solver"
         )
     page.line(f"written to {place}")
+    page.warnings(f"{name} was damaged or of another sweep, and was written again" for name in run.damaged)
 
 
 def _executor(

@@ -100,15 +100,23 @@ def read_toml(path: Path) -> dict[str, object]:
     Raises:
         SpecError: The file is absent, cannot be read, or is not valid TOML.
     """
-    text = ""
     try:
-        text = read_text(path)
-        return tomllib.loads(text)
+        return parse_toml(read_text(path), str(path))
     except (OSError, UnicodeDecodeError) as error:
         raise SpecError.unreadable(path, error) from None
+
+
+def parse_toml(text: str, where: str) -> dict[str, object]:
+    """Return the content of a TOML text.
+
+    Raises:
+        SpecError: The text is not valid TOML.
+    """
+    try:
+        return tomllib.loads(text)
     except RecursionError:
-        raise SpecError("is nested too deeply", where=str(path), hint="correct the syntax") from None
+        raise SpecError("is nested too deeply", where=where, hint="correct the syntax") from None
     except ValueError as error:  # TOMLDecodeError, or a number has more digits than Python converts.
         other = "JSON" if text.lstrip().startswith("{") else "YAML" if _YAML_LINE.search(text) else ""
         hint = f"this looks like {other}: in TOML write [table], then key = value" if other else "correct the syntax"
-        raise SpecError(f"is not valid TOML ({error})", where=str(path), hint=hint) from None
+        raise SpecError(f"is not valid TOML ({error})", where=where, hint=hint) from None

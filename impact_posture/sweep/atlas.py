@@ -2,31 +2,28 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from impact_posture.config.checked import checked
-from impact_posture.errors import InputError, OutputError, SpecError
+from impact_posture.errors import InputError, OutputError, SpecError, listed
 from impact_posture.posture.formulation.problem_file import dump_settings
 from impact_posture.sweep.case_solver import CaseSolver
-from impact_posture.sweep.shard_table import passes_of, read_postures
+from impact_posture.sweep.shard_table import passes_of, read_postures, shard_name
 from impact_posture.sweep.sweep_file import Sweep
+from impact_posture.sweep.sweep_manifest import MANIFEST, check_key, manifest_text, read_manifest
 from impact_posture.system.libraries import source_key
 from impact_posture.system.output_folder import check_output, is_ours, used_alone, write_record, write_whole
-from impact_posture.system.text_files import read_text
-from impact_posture.version import __version__
 
 if TYPE_CHECKING:
     from pyarrow.dataset import Dataset
 
-SCHEMA = "impact-posture/sweep-folder/1"
-MANIFEST, _DATA = "manifest.json", "data"
+_DATA = "data"
 # Folder for results of the first pass.  Neighboring shards start from these results even after the second pass has
 # replaced the file in _DATA.
 _FIRST_PASS = "first-pass"
@@ -55,17 +52,22 @@ class Atlas:
 
     def __init__(self, folder: Path, sweep: Sweep, key: str) -> None:
         self.folder, self._sweep, self._key = folder, sweep, key
+        # Shard files that cannot be used, as paths below the folder.
+        self.damaged = set[str]()
         self._postures = lru_cache(_KEPT)(self._read_postures)
 
     @contextmanager
     def opened(self) -> Iterator[None]:
         """Create the folder or continue in it, and lock it against other processes during the ``with`` block.
 
+        A damaged manifest is written again.
+
         Raises:
             OutputError: The folder contains other files, or results of another sweep or version, or another process
                 uses it.
+            SpecError: The manifest is too damaged to belong to a known sweep.
         """
-        manifest = self.folder / MANIFEST
+        manifest, text = self.folder / MANIFEST, manifest_text(self._sweep, self._key)
         if not os.path.isfile(manifest):
             # A run that was killed before it wrote the manifest leaves a record file but no results.
             if not is_ours(self.folder, "sweep") or (self.folder / _DATA).exists():
@@ -76,12 +78,15 @@ class Atlas:
             except OSError as error:
                 hint = "free disk space or choose another `out`"
                 raise OutputError.unwritable(self.folder, error, hint) from None
-            write_whole(manifest, json.dumps(self._manifest(), indent=1) + "\n")
-        known = read_manifest(self.folder)
-        if known["key"] != self._key:
-            other = "another version" if known["version"] != __version__ else "another sweep, or other code or robots"
-            raise OutputError(f"contains results of {other}", where=str(self.folder), hint="choose another `out`")
-        with used_alone(self.folder, manifest):
+            write_whole(manifest, text)
+        check_key(self.folder, self._key)
+        with ExitStack() as locks:
+            locks.enter_context(used_alone(self.folder, manifest))
+            if manifest.read_bytes() != text.encode():
+                self.damaged.add(MANIFEST)
+                write_whole(manifest, text)
+                # The lock of the old file does not hold for the new file.
+                locks.enter_context(used_alone(self.folder, manifest))
             for part in self.folder.glob("*/case=*/.shard-*.parquet.*.part"):
                 with suppress(OSError):
                     part.unlink()
@@ -90,7 +95,7 @@ class Atlas:
     def waiting(self) -> tuple[list[int], list[int]]:
         """Return the shards that need the first pass, and the shards that need the second pass."""
         passes, shards = self._sweep.passes, range(self._sweep.shards)
-        missing = [shard for shard in shards if self._passes(self._path(shard), shard) != passes]
+        missing = [shard for shard in shards if self._read(shard)[0] != passes]
         if passes == 1:
             return missing, []
         needed = {*missing, *(other for shard in missing for other in self._sweep.beside(shard))}
@@ -109,10 +114,10 @@ class Atlas:
 
     def write(self, shard: int, content: bytes, passes: int) -> None:
         """Write the ``content`` of a shard file after the given number of ``passes``."""
-        before = self._passes(self._path(shard), shard)
+        before, known = self._read(shard)
         if before == 1 < passes:
             # Keep the file from the first pass, because neighboring shards still need it.
-            self._write(self._path(shard, _FIRST_PASS), self._content(shard))
+            self._write(self._path(shard, _FIRST_PASS), known)
         self._write(self._path(shard, _FIRST_PASS if before > passes else _DATA), content)
 
     def finish(self) -> None:
@@ -132,61 +137,32 @@ class Atlas:
         write_whole(path, content)
 
     def _path(self, shard: int, place: str = _DATA) -> Path:
-        case, part = divmod(shard, self._sweep.shards_of_case)
-        return self.folder / place / f"case={case}" / f"shard-{part:06d}.parquet"
+        return self.folder / place / shard_name(self._sweep, shard)
 
-    def _passes(self, path: Path, shard: int) -> int:
-        return passes_of(path, self._key, len(self._sweep.span(shard)[1]))
+    def _read(self, shard: int, place: str = _DATA) -> tuple[int, bytes]:
+        """Return after how many passes a shard file was written, 0 if it cannot be used, and its content."""
+        path, content, passes = self._path(shard, place), b"", 0
+        with suppress(OSError):
+            content = path.read_bytes()
+            passes = passes_of(content, self._key, shard_name(self._sweep, shard))
+        if not passes and os.path.lexists(path):
+            self.damaged.add(path.relative_to(self.folder).as_posix())
+        return passes, content
 
-    def _first(self, shard: int) -> Path | None:
-        """Return the path of the shard file from the first pass; ``None`` if the file does not exist."""
-        paths = self._path(shard), self._path(shard, _FIRST_PASS)
-        return next((path for path in paths if self._passes(path, shard) == 1), None)
+    def _first(self, shard: int) -> bytes | None:
+        """Return the content of a shard file from the first pass; ``None`` if there is no usable file."""
+        files = (self._read(shard, place) for place in (_DATA, _FIRST_PASS))
+        return next((content for passes, content in files if passes == 1), None)
 
     def _content(self, shard: int) -> bytes:
-        path = self._first(shard)
-        if path is None:
-            raise OutputError(
-                "a file was deleted during the run", where=str(self.folder), hint="run sweep again to continue"
-            )
-        return path.read_bytes()
+        content = self._first(shard)
+        if content is None:
+            what, hint = "a file was deleted or damaged during the run", "run sweep again to continue"
+            raise OutputError(what, where=str(self.folder), hint=hint)
+        return content
 
     def _read_postures(self, shard: int) -> dict[int, list[float] | None]:
         return dict(zip(self._sweep.span(shard)[1], read_postures(self._content(shard)), strict=True))
-
-    def _manifest(self) -> dict[str, Any]:
-        sweep = self._sweep
-        return {
-            "schema": SCHEMA,
-            "version": __version__,
-            "key": self._key,
-            "points": sweep.points,
-            "shards": sweep.shards,
-            "shard": sweep.shard,
-            "cases": [{"values": dict(case.values), "problem": dump_settings(case.settings)} for case in sweep.cases],
-            "axes": [{"name": axis.name, "values": list(axis.values)} for axis in sweep.grid.axes],
-        }
-
-
-def read_manifest(folder: Path) -> dict[str, Any]:
-    """Return the manifest of a sweep folder.
-
-    Raises:
-        SpecError: The manifest is missing or cannot be read.
-    """
-    path = folder / MANIFEST
-    try:
-        content = json.loads(read_text(path))
-        if content["schema"] != SCHEMA:
-            raise ValueError(f"schema {content['schema']}")
-        return {**content, "key": str(content["key"]), "version": str(content["version"])}
-    except FileNotFoundError:
-        raise SpecError(
-            "contains no manifest.json", where=str(folder), hint="name a folder that sweep wrote"
-        ) from None
-    except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
-        what = f"is not a manifest of a sweep ({type(error).__name__}: {error})"
-        raise SpecError(what, where=str(path), hint="name a folder that sweep wrote") from None
 
 
 @checked
@@ -195,17 +171,27 @@ def open_atlas(folder: str | Path) -> Dataset:
 
     Raises:
         InputError: pyarrow is not installed.
-        SpecError: The folder is not a sweep folder, or has no finished shard.
+        SpecError: The folder is not a sweep folder, has no finished shard, or is damaged.
     """
     check_package("pyarrow", "sweep")
-    from pyarrow import ArrowException, dataset
+    from pyarrow import ArrowException, dataset, fs
 
-    read_manifest(Path(folder))
-    data = Path(folder) / _DATA
-    if next(data.glob("case=*/*.parquet"), None) is None:
+    manifest, data = read_manifest(Path(folder)), Path(folder) / _DATA
+    paths = sorted(data.glob("case=*/*.parquet"))
+    if not paths:
         raise SpecError("has no finished shard", where=str(folder), hint="run sweep again to continue")
+    pages = dataset.ParquetFragmentScanOptions(page_checksum_verification=True)
+    partitions = dataset.FileSystemFactoryOptions(str(data), partitioning=dataset.HivePartitioning.discover())
     try:
-        return dataset.dataset(data, format="parquet", partitioning="hive")
+        names = {path.relative_to(data).as_posix(): path for path in paths} if manifest.has_checksums else {}
+        damaged = [name for name, path in names.items() if not passes_of(path.read_bytes(), manifest.key, name)]
+        if damaged:
+            what, hint = f"has damaged shards ({listed(damaged)})", "run sweep again, which solves them again"
+            raise SpecError(what, where=str(folder), hint=hint)
+        form = dataset.ParquetFileFormat(default_fragment_scan_options=pages)
+        return dataset.FileSystemDatasetFactory(
+            fs.LocalFileSystem(), list(map(str, paths)), form, partitions
+        ).finish()
     except (OSError, ArrowException) as error:
         raise SpecError(f"cannot be read ({error})", where=str(folder), hint="run sweep again") from None
 

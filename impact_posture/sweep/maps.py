@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,16 +15,17 @@ from matplotlib.patches import Patch, Rectangle
 from numpy.typing import NDArray
 
 from impact_posture.config.problem_settings import ProblemSettings
-from impact_posture.config.table_validation import validate
-from impact_posture.errors import InputError, SpecError, nearest
+from impact_posture.config.table_validation import parse_toml, validate
+from impact_posture.errors import InputError, nearest
 from impact_posture.output.plot.style import GRAY, INK, PALE, VERMILLION, framed, save, shared_legend
 from impact_posture.posture.formulation.problem_file import prepare
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem
 from impact_posture.posture.search.multistart import wrapped_difference
-from impact_posture.sweep.atlas import open_atlas, read_manifest
+from impact_posture.sweep.atlas import open_atlas
 from impact_posture.sweep.point_search import SWITCH
 from impact_posture.sweep.shard_table import STATUS
 from impact_posture.sweep.sweep_file import Axis, Grid
+from impact_posture.sweep.sweep_manifest import MANIFEST, read_manifest
 from impact_posture.system.arrays import Array
 from impact_posture.system.escape import plot_label
 
@@ -77,29 +77,19 @@ def draw_maps(folder: Path, out: Path, axes: Sequence[str] | None = None, format
     from pyarrow import compute
 
     data, manifest = open_atlas(folder), read_manifest(folder)
-    try:
-        grid = Grid(tuple(Axis(axis["name"], tuple(map(_hashable, axis["values"]))) for axis in manifest["axes"]))
-        cases, points = manifest["cases"], int(manifest["points"])
-        problems = [
-            prepare(validate(ProblemSettings, tomllib.loads(c["problem"]), str(folder))).problem for c in cases
-        ]
-    except (LookupError, TypeError, ValueError) as error:
-        where = str(folder / "manifest.json")
-        raise SpecError(f"is damaged ({error})", where=where, hint="run sweep again") from None
+    grid, where = manifest.grid, str(folder / MANIFEST)
+    settings = [validate(ProblemSettings, parse_toml(case.problem, where), where) for case in manifest.cases]
+    problems = [prepare(setting).problem for setting in settings]
     across, upwards = _chosen(grid, axes)
     plane = _plane(grid, across, upwards)
     counts = {status: data.count_rows(filter=compute.field("status") == status) for status in STATUS}
     switches, best, files = 0, list[dict[str, Any]](), list[Path]()
-    for number, (case, problem) in enumerate(zip(cases, problems, strict=True)):
+    for number, (case, problem) in enumerate(zip(manifest.cases, problems, strict=True)):
         table = _Slice(data, plane + number * grid.size, problem)
         switches += len(table.switches)
-        best += _best(data, grid, number, case["values"])
-        files += _draw(table, grid, (across, upwards), case["values"], problem, out / f"map-{number}", formats)
-    return Shown(points, counts, switches, best, files)
-
-
-def _hashable(value: Any) -> Any:
-    return tuple(value) if isinstance(value, list) else value
+        best += _best(data, grid, number, case.values)
+        files += _draw(table, grid, (across, upwards), case.values, problem, out / f"map-{number}", formats)
+    return Shown(manifest.points, counts, switches, best, files)
 
 
 def _chosen(grid: Grid, axes: Sequence[str] | None) -> tuple[int, int | None]:

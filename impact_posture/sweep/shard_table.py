@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +11,7 @@ import numpy as np
 from impact_posture.sweep.point_search import PointResult, Start
 from impact_posture.sweep.sweep_file import Axis, Sweep
 from impact_posture.system.arrays import Array
+from impact_posture.system.sealed_files import UNSEALED, is_intact, sealed
 
 STATUS = ("certified", "infeasible", "uncertified", "undefined")
 PREDICTED = ("predicted_impulse", "predicted_jump", "attainable_speed")
@@ -26,7 +26,7 @@ def write_shard(
     results: Sequence[PointResult],
     predicted: Callable[[Mapping[str, Any], Array, Mapping[str, Any]], dict[str, float | None]],
 ) -> bytes:
-    """Return the content of the Parquet file of a shard after ``passes`` passes.
+    """Return the content of the Parquet file of a shard after ``passes`` passes, with checksums.
 
     ``predicted`` computes the columns :data:`PREDICTED` of a point from its grid values, posture and other columns.
     """
@@ -47,10 +47,17 @@ def write_shard(
         rows.append({"point": case * sweep.grid.size + point, **values, **odd, **result.row})
         if result.q is not None:
             rows[-1] |= predicted(values, result.q, result.row)
-    table = pa.Table.from_pylist(rows, pa.schema(columns, metadata={"sweep": key, "passes": str(passes)}))
+    identity = {"sweep": key, "shard": shard_name(sweep, index), "passes": str(passes), "checksum": UNSEALED}
+    table = pa.Table.from_pylist(rows, pa.schema(columns, metadata=identity))
     sink = pa.BufferOutputStream()
-    parquet.write_table(table, sink, compression="zstd")
-    return bytes(sink.getvalue())
+    parquet.write_table(table, sink, compression="zstd", write_page_checksum=True)
+    return sealed(bytes(sink.getvalue()))
+
+
+def shard_name(sweep: Sweep, index: int) -> str:
+    """Return the path of a shard file below the folder of all shards."""
+    case, part = divmod(index, sweep.shards_of_case)
+    return f"case={case}/shard-{part:06d}.parquet"
 
 
 def read_shard(content: bytes) -> list[PointResult]:
@@ -75,16 +82,21 @@ def read_postures(content: bytes) -> list[list[float] | None]:
     return q
 
 
-def passes_of(path: Path, key: str, points: int) -> int:
-    """Return after how many passes a shard file was written, 1 or 2; 0 if it is incomplete or has another key."""
+def passes_of(content: bytes, key: str, name: str) -> int:
+    """Return after how many passes a shard file was written, 1 or 2.
+
+    The result is 0 if the file is damaged, or is not the shard ``name`` of the sweep ``key``.
+    """
+    import pyarrow as pa
     from pyarrow import ArrowException, parquet
 
+    if not is_intact(content):
+        return 0
     try:
-        table = parquet.read_metadata(path)
-        metadata = table.metadata or {}
-        fits = table.num_rows == points and metadata.get(b"sweep") == key.encode()
+        metadata = parquet.read_metadata(pa.BufferReader(content)).metadata
+        fits = (metadata[b"sweep"], metadata[b"shard"]) == (key.encode(), name.encode())
         return int(metadata[b"passes"]) if fits else 0
-    except (OSError, ArrowException, LookupError, ValueError):
+    except (ArrowException, LookupError, TypeError):  # another sealed file, such as the manifest
         return 0
 
 

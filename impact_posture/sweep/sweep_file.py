@@ -8,7 +8,7 @@ from functools import cached_property
 from itertools import product
 from math import prod
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 
@@ -22,7 +22,8 @@ from impact_posture.robot.robot_loader import from_folder
 # Axes along which one nonlinear program is used for all values, from the slowest to the fastest.  ``x``, ``y`` and
 # ``z`` are offsets of the target.
 OFFSETS = ("x", "y", "z")
-_INNER = ("normal", "target_quaternion", "target_position", *OFFSETS, "speed")
+InnerAxis = Literal["normal", "target_quaternion", "target_position", "x", "y", "z", "speed"]
+_INNER = get_args(InnerAxis)
 # Settings that cannot be an axis, because they concern the search or the output.
 _NO_AXIS = ("schema", "q", "starts", "seed", "tradeoff", "tradeoff_against", "path", "search", "finish_all",
             "contact")  # fmt: skip

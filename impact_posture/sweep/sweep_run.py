@@ -31,6 +31,8 @@ class SweepRun:
         shards: Number of shards that this run finished.
         solver_s: Sum of the wall times that the workers spent in IPOPT, s.
         total_s: Sum of the wall times of all shards, s.
+        damaged: Files that were damaged or of another sweep, as paths below the folder.  They were replaced if they
+            were needed.
     """
 
     folder: Path
@@ -39,6 +41,7 @@ class SweepRun:
     shards: int
     solver_s: float
     total_s: float
+    damaged: tuple[str, ...]
 
 
 def run_sweep(
@@ -93,7 +96,7 @@ def run_sweep(
         except BrokenExecutor:
             raise WorkerDied("workers") from None
         atlas.finish()
-    return SweepRun(folder, sweep.points, counts, shards, solver_s, total_s)
+    return SweepRun(folder, sweep.points, counts, shards, solver_s, total_s, tuple(sorted(atlas.damaged)))
 
 
 def _results(tasks: Iterable[tuple[Any, ...]], executor: Executor | None, in_hand: int) -> Iterator[ShardResult]:

@@ -1,0 +1,28 @@
+"""Files that contain the SHA-256 of their other bytes, so that any damage is noticed."""
+
+from __future__ import annotations
+
+from hashlib import sha256
+
+_MARK, _DIGITS = b"sha256:", 64
+# Text that a file contains in place of its SHA-256 before it is sealed.
+UNSEALED = _MARK.decode() + "0" * _DIGITS
+
+
+def sealed(content: bytes) -> bytes:
+    """Return the content of a file with the SHA-256 of its other bytes behind its last ``sha256:``."""
+    begin, digest = _digest(content)
+    return content[:begin] + digest + content[begin + _DIGITS :]
+
+
+def is_intact(content: bytes) -> bool:
+    """Return whether the content of a sealed file is undamaged."""
+    begin, digest = _digest(content)
+    return content[begin : begin + _DIGITS] == digest
+
+
+def _digest(content: bytes) -> tuple[int, bytes]:
+    begin = content.rfind(_MARK) + len(_MARK)
+    digest = sha256(memoryview(content)[:begin])
+    digest.update(memoryview(content)[begin + _DIGITS :])
+    return begin, digest.hexdigest().encode()
