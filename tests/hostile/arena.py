@@ -84,12 +84,12 @@ TALLY = Tally()
 
 
 @contextmanager
-def judging() -> Iterator[Callable[[str, Sequence[str]], None]]:
-    """Yield a function that counts an input with its list of complaints; fail at the end with all complaints."""
+def judging() -> Iterator[Callable[..., None]]:
+    """Yield a function that counts inputs with their list of complaints; fail at the end with all complaints."""
     failures, before = [], TALLY.tried
 
-    def judge(case: str, complaints: Sequence[str]) -> None:
-        TALLY.tried += 1
+    def judge(case: str, complaints: Sequence[str], count: int = 1) -> None:
+        TALLY.tried += count
         if complaints:
             TALLY.mishandled += 1
             failures.append(f"{case}\n    {'; '.join(complaints)}")

@@ -191,7 +191,7 @@ static void ip_advance(ip_context *c, double dt)
     ip_integrate(c->posture, away, c->level * (1.0 - exp(-dt / c->p.robust_follow[0])), c->posture);
   }
   if (--c->count <= 0) {
-    c->count = (int)c->p.robust_every[0];
+    c->count = (int)fmin(c->p.robust_every[0], 1e9);
     ip_evaluate(c);
   }
 #endif
