@@ -75,3 +75,8 @@ def test_the_end_of_another_program_is_not_used(solved: Solved) -> None:
     cold, warm_run = (other.solve(home.q, scale=scale, warm=end) for end in (None, home.end))
     assert (warm_run.iterations, warm_run.minimized) == (cold.iterations, cold.minimized)
     np.testing.assert_array_equal(warm_run.q, cold.q)
+
+
+def test_one_start_and_a_guess_are_two_starts() -> None:
+    problem = prepare(ProblemSettings(robot="tilthex_arm", normal=DOWN)).problem
+    assert solve(problem, starts=1, jobs=1, compile="never", guesses=(problem.given,)).starts == 2

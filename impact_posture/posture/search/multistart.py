@@ -117,10 +117,11 @@ def solve(
 ) -> PostureSolution:
     """Solve from the given posture, from feasible ``guesses``, shape (nq,) each, and from random feasible postures.
 
-    ``starts`` is the number of all starts, and ``seed`` the seed of the random postures.  ``progress`` is called with
-    the numbers of finished starts and of all starts.  ``finish_all`` also finishes starts that can no longer become
-    the best.  If ``screened`` is not 0, at most this number of random postures is screened
-    (:mod:`impact_posture.posture.search.screening`), and the best are the starts, instead of random postures.
+    ``starts`` is the least number of starts, because the given posture and all guesses are always starts.  ``seed``
+    is the seed of the random postures.  ``progress`` is called with the numbers of finished starts and of all starts.
+    ``finish_all`` also finishes starts that can no longer become the best.  If ``screened`` is not 0, at most this
+    number of random postures is screened (:mod:`impact_posture.posture.search.screening`), and the best are the
+    starts, instead of random postures.
 
     Raises:
         Infeasible: No posture satisfies the constraints; the error names the conflicting constraints.
@@ -135,6 +136,7 @@ def solve(
         screening = screen(problem, initial, screened, seed)
         known, hits = (*known, *screening.guesses), [*hits, *screening.hits]
         starts = len(known)
+    starts = max(starts, len(known))
     hits += [1] * (starts - len(hits))
     draws = StartDraws(problem, known, starts, seed)
     search = GrowingSearch(problem, draws, scale, compile=compile, finish_all=finish_all, rows=rows)
