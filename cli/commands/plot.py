@@ -28,22 +28,20 @@ def plot(
     figure: Figures = None,
     format: options.Formats = None,
     out: PictureOut = None,
+    force: options.ForceFiles = False,
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    from impact_posture.output.plot import draw_all
+    from impact_posture.output.plot import draw_into
     from impact_posture.output.result_folder import FORMATS
     from impact_posture.output.result_reader import load_view
-    from impact_posture.system.output_folder import add_to_record
 
     folder = Path(result_dir)
     into = Path(out) if out else folder
     formats = format or FORMATS
     page = Page(json=json, quiet=quiet)
     with page.progress("drawing"):
-        written = draw_all(load_view(folder), into, formats, figure)
-    # A result folder keeps a list of its files, which must include the new files.
-    add_to_record(into, written)
+        written = draw_into(load_view(folder), into, formats, figure, force=force)
     if json:
         print_json({"schema": "impact-posture/plot/1", "files": [str(path) for path in written]})
         return

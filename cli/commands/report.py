@@ -19,10 +19,12 @@ OutputFolder = Annotated[
 
 
 def report(
-    folder: OutputFolder, meshes: options.Meshes = False, json: options.Json = False, quiet: options.Quiet = False
+    folder: OutputFolder,
+    meshes: options.Meshes = False,
+    force: options.ForceFiles = False,
+    json: options.Json = False,
+    quiet: options.Quiet = False,
 ) -> None:
-    from impact_posture.system.output_folder import add_to_record
-
     page, place = Page(json=json, quiet=quiet), Path(folder)
     rewrite: Callable[..., Path]
     if any(os.path.isfile(place / name) for name in ("run.json", "comparison.json")):
@@ -30,8 +32,7 @@ def report(
     else:
         from impact_posture.output.result_reader import rewrite_report as rewrite
     with page.progress("writing"):
-        written = rewrite(place, meshes=meshes)
-    add_to_record(place, [written])
+        written = rewrite(place, meshes=meshes, force=force)
     show_written(page, "report", written)
 
 

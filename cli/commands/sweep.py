@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from impact_posture.config.setting import OUTPUT
 from impact_posture_cli import options
 from impact_posture_cli.error_boundary import UsageError
 from impact_posture_cli.output import Page, number, print_json
@@ -36,6 +37,10 @@ Slurm = Annotated[
 Out = Annotated[
     str | None, options.out_option("Folder of the sweep; with show, folder of the maps.", "./SWEEP, or DIR/maps")
 ]
+Force = Annotated[
+    bool,
+    options.option("--force", OUTPUT, "Replace another sweep; with show, files that this program did not write."),
+]
 MapAxes = Annotated[
     str | None, options.option("--axes", "Maps", "Axes of the maps.", metavar="A,B", show_default="the two longest")
 ]
@@ -50,6 +55,7 @@ def sweep(
     slurm: Slurm = None,
     axes: MapAxes = None,
     out: Out = None,
+    force: Force = False,
     format: options.Formats = None,
     json: options.Json = False,
     quiet: options.Quiet = False,
@@ -58,7 +64,7 @@ def sweep(
     if target == "show":
         if folder is None:
             raise UsageError("Missing argument 'DIR': the folder that sweep wrote.")
-        _show(page, Path(folder), axes, out, format)
+        _show(page, Path(folder), axes, out, format, force)
         return
     if folder is not None:
         raise UsageError("DIR is only allowed after show: use --out for the folder of the sweep.")
@@ -77,7 +83,7 @@ def sweep(
         where as executor,
         page.progress("solving", "points in all passes", first="checking") as advance,
     ):
-        run = run_sweep(request, place, executor, progress=advance)
+        run = run_sweep(request, place, executor, force=force, progress=advance)
     document: dict[str, Any] = {
         "schema": "impact-posture/sweep-run/1",
         "folder": str(place),
@@ -119,13 +125,13 @@ def _executor(
     return process_pool(workers) if workers > 1 else nullcontext()
 
 
-def _show(page: Page, folder: Path, axes: str | None, out: str | None, format: list[Any] | None) -> None:
+def _show(page: Page, folder: Path, axes: str | None, out: str | None, format: list[Any] | None, force: bool) -> None:
     """Draw the maps of a sweep folder; print its best points and how often neighbors have different optima."""
     from impact_posture.sweep.maps import draw_maps
 
     wanted = tuple(name.strip() for name in axes.split(",")) if axes else None
     with page.progress("drawing"):
-        shown = draw_maps(folder, Path(out) if out else folder / "maps", wanted, format or ("png",))
+        shown = draw_maps(folder, Path(out) if out else folder / "maps", wanted, format or ("png",), force=force)
     if page.json:
         print_json(shown.to_dict())
         return

@@ -234,12 +234,18 @@ class PostureResult:
 
     @checked
     def plot(
-        self, out: str | Path, formats: Sequence[str] = FORMATS, only: Sequence[str] | None = None
-    ) -> list[Path]:
-        """Draw the figures into a folder, and return the paths of the figures."""
-        from impact_posture.output.plot import draw_all
+        self, out: str | Path, formats: Sequence[str] = FORMATS, only: Sequence[str] | None = None, *,
+        force: bool = False,
+    ) -> list[Path]:  # fmt: skip
+        """Draw the figures into a folder, and return their paths.  With ``force``, replace files of the user too.
 
-        return draw_all(result_view(self._prepared, self._postures, self.motion), Path(out), formats, only)
+        Raises:
+            OutputError: A file of the user has the name of a figure, or the folder cannot be written.
+        """
+        from impact_posture.output.plot import draw_into
+
+        view = result_view(self._prepared, self._postures, self.motion)
+        return draw_into(view, Path(out), formats, only, force=force)
 
     @checked
     def export(self, out: str | Path, *, build: bool = True, **options: Any) -> Export:

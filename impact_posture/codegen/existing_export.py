@@ -11,8 +11,8 @@ from impact_posture.codegen.compile_and_check import compile_and_check
 from impact_posture.codegen.export import Export, default_prefix
 from impact_posture.codegen.manifest_builder import build_manifest
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.system.folder_record import own_files
 from impact_posture.system.libraries import library_path
-from impact_posture.system.output_folder import own_files
 from impact_posture.system.toolchain import find_compiler
 
 # Keys of a manifest whose values depend on more than the objective.

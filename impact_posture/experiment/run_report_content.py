@@ -13,7 +13,7 @@ from impact_posture.output.plot.result_view import number
 from impact_posture.output.plot.run_view import RunView, run_header
 from impact_posture.output.report.report_page import Content, Table
 from impact_posture.simulation.metrics import AFTER_TOUCH
-from impact_posture.system.output_folder import typed_command
+from impact_posture.system.folder_record import typed_command
 
 # Metrics in the table of a report: key, unit and meaning.
 _METRICS = (

@@ -84,24 +84,25 @@ def run_view(job: Job, part: Document, series: Series) -> RunView:
 def try_report(folder: Path, scenario: str, *, meshes: bool) -> str:
     """Write the report of a folder.  If that fails, return the reason.  An exception would discard the runs."""
     try:
-        write_run_report(folder, scenario, meshes=meshes)
+        write_run_report(folder, scenario, meshes=meshes, force=None)
     except Exception as error:
         return one_line(str(error) if isinstance(error, ImpactPostureError) else f"{type(error).__name__}: {error}")
     return ""
 
 
-def write_run_report(folder: Path, scenario: str = "", *, meshes: bool = False) -> Path:
+def write_run_report(folder: Path, scenario: str = "", *, meshes: bool = False, force: bool | None = False) -> Path:
     """Write ``report.html`` of a run or comparison into its folder.  Return the path of the report.
 
     Args:
         folder: Folder that ``simulate`` or ``compare`` has written.
         scenario: Name or file of the scenario; by default, the scenario that the folder names.
         meshes: If true, the report contains the meshes of the user's URDF.
+        force: Whether a ``report.html`` of the user may be replaced; ``None`` in a new folder.
 
     Raises:
         SpecError: The folder contains neither a run nor a comparison, or its files are inconsistent.
         ImpactPostureError: The scenario cannot be set up.
-        OutputError: The report cannot be written.
+        OutputError: A ``report.html`` of the user would be replaced, or the report cannot be written.
     """
     try:
         if os.path.isfile(folder / SIMULATION):
@@ -119,7 +120,7 @@ def write_run_report(folder: Path, scenario: str = "", *, meshes: bool = False) 
                     "contains no run that can be shown", where=str(folder), hint="see the status in comparison.json"
                 )
             content = comparison_content(folder, document, runs[0][0])
-        return write_page(folder, content, run_scene(runs, meshes=meshes))
+        return write_page(folder, content, run_scene(runs, meshes=meshes), force)
     except _BROKEN as error:
         what = f"contains no complete run or comparison ({type(error).__name__}: {error})"
         raise SpecError(what, where=str(folder), hint="run simulate or compare again") from None

@@ -14,7 +14,7 @@ from impact_posture.output.result_reader import SolvedPostures, motion_of, resul
 from impact_posture.posture.formulation.problem_file import Prepared
 from impact_posture.posture.search.growing_search import Progress
 from impact_posture.system.escape import file_name
-from impact_posture.system.output_folder import write_record
+from impact_posture.system.folder_record import write_record
 from impact_posture.system.processes import fork_call, fork_map
 
 # Import Matplotlib and the C export only where they are used, because the import takes longer than a small problem.

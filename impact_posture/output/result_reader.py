@@ -56,18 +56,19 @@ def load_view(folder: Path) -> ResultView:
     return load_result(folder)[1]
 
 
-def rewrite_report(folder: Path, *, meshes: bool = False) -> Path:
+def rewrite_report(folder: Path, *, meshes: bool = False, force: bool = False) -> Path:
     """Write ``report.html`` of a result folder again; return its path.
 
     Raises:
         SpecError: As in :func:`load_result`.
-        OutputError: The report cannot be written.
+        OutputError: A ``report.html`` of the user would be replaced and ``force`` is false, or the report cannot be
+            written.
     """
     from impact_posture.output.report.result_report import write_result_report
 
     loaded = load_result(folder)
     try:
-        return write_result_report(folder, *loaded, meshes=meshes)
+        return write_result_report(folder, *loaded, meshes=meshes, force=force)
     except _BROKEN as error:
         raise _broken(folder, error) from None
 

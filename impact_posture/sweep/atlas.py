@@ -18,7 +18,7 @@ from impact_posture.sweep.shard_table import passes_of, read_postures, shard_nam
 from impact_posture.sweep.sweep_file import Sweep
 from impact_posture.sweep.sweep_manifest import MANIFEST, check_key, manifest_text, read_manifest
 from impact_posture.system.libraries import source_key
-from impact_posture.system.output_folder import check_output, is_ours, used_alone, write_record, write_whole
+from impact_posture.system.output_folder import used_alone, whole_folder, write_whole
 
 if TYPE_CHECKING:
     from pyarrow.dataset import Dataset
@@ -57,10 +57,10 @@ class Atlas:
         self._postures = lru_cache(_KEPT)(self._read_postures)
 
     @contextmanager
-    def opened(self) -> Iterator[None]:
+    def opened(self, force: bool = False) -> Iterator[None]:
         """Create the folder or continue in it, and lock it against other processes during the ``with`` block.
 
-        A damaged manifest is written again.
+        A damaged manifest is written again.  With ``force``, shards of another sweep or version are removed.
 
         Raises:
             OutputError: The folder contains other files, or results of another sweep or version, or another process
@@ -69,24 +69,25 @@ class Atlas:
         """
         manifest, text = self.folder / MANIFEST, manifest_text(self._sweep, self._key)
         if not os.path.isfile(manifest):
-            # A run that was killed before it wrote the manifest leaves a record file but no results.
-            if not is_ours(self.folder, "sweep") or (self.folder / _DATA).exists():
-                check_output(self.folder, force=False, kind="sweep")
-            try:
-                self.folder.mkdir(parents=True, exist_ok=True)
-                write_record(self.folder, "sweep")
-            except OSError as error:
-                hint = "free disk space or choose another `out`"
-                raise OutputError.unwritable(self.folder, error, hint) from None
-            write_whole(manifest, text)
-        check_key(self.folder, self._key)
+            with whole_folder(self.folder, force=force, kind="sweep") as beside:
+                write_whole(beside / MANIFEST, text)
+        other = False
+        try:
+            check_key(self.folder, self._key)
+        except OutputError:
+            if not force:
+                raise
+            other = True
         with ExitStack() as locks:
             locks.enter_context(used_alone(self.folder, manifest))
             if manifest.read_bytes() != text.encode():
-                self.damaged.add(MANIFEST)
+                self.damaged.update([] if other else [MANIFEST])
                 write_whole(manifest, text)
                 # The lock of the old file does not hold for the new file.
                 locks.enter_context(used_alone(self.folder, manifest))
+            for place in (_DATA, _FIRST_PASS) if other else ():
+                for shard in (self.folder / place).glob("case=*/shard-*.parquet"):
+                    shard.unlink()
             for part in self.folder.glob("*/case=*/.shard-*.parquet.*.part"):
                 with suppress(OSError):
                     part.unlink()

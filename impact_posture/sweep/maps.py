@@ -28,6 +28,7 @@ from impact_posture.sweep.sweep_file import Axis, Grid
 from impact_posture.sweep.sweep_manifest import MANIFEST, read_manifest
 from impact_posture.system.arrays import Array
 from impact_posture.system.escape import plot_label
+from impact_posture.system.output_folder import added_files
 
 # Two neighboring points count as different optima if their postures differ by more than SWITCH and by more than this
 # multiple of the lower quartile of all differences.  The lower quartile estimates the difference between neighbors
@@ -64,14 +65,23 @@ class Shown:
         return {"schema": "impact-posture/sweep-show/1", **vars(self), "files": files}
 
 
-def draw_maps(folder: Path, out: Path, axes: Sequence[str] | None = None, formats: Sequence[str] = ("png",)) -> Shown:
+def draw_maps(
+    folder: Path,
+    out: Path,
+    axes: Sequence[str] | None = None,
+    formats: Sequence[str] = ("png",),
+    *,
+    force: bool = False,
+) -> Shown:
     """Draw a map for each case of a sweep folder and write it into ``out``.  The sweep may be unfinished.
 
     ``axes`` contains the names of the horizontal and the vertical axis, by default the two axes with the most values.
-    The map shows the points at which the other axes have their middle values.
+    The map shows the points at which the other axes have their middle values.  With ``force``, files of the user in
+    ``out`` that have the name of a map are replaced.
 
     Raises:
         InputError: An axis is unknown.
+        OutputError: A file of the user has the name of a map, or ``out`` cannot be written.
         SpecError: The folder is not a sweep folder, or is damaged.
     """
     from pyarrow import compute
@@ -84,12 +94,14 @@ def draw_maps(folder: Path, out: Path, axes: Sequence[str] | None = None, format
     plane = _plane(grid, across, upwards)
     counts = {status: data.count_rows(filter=compute.field("status") == status) for status in STATUS}
     switches, best, files = 0, list[dict[str, Any]](), list[Path]()
-    for number, (case, problem) in enumerate(zip(manifest.cases, problems, strict=True)):
-        table = _Slice(data, plane + number * grid.size, problem)
-        switches += len(table.switches)
-        best += _best(data, grid, number, case.values)
-        files += _draw(table, grid, (across, upwards), case.values, problem, out / f"map-{number}", formats)
-    return Shown(manifest.points, counts, switches, best, files)
+    with added_files(out, force=force) as beside:
+        for number, (case, problem) in enumerate(zip(manifest.cases, problems, strict=True)):
+            table = _Slice(data, plane + number * grid.size, problem)
+            switches += len(table.switches)
+            best += _best(data, grid, number, case.values)
+            path = beside / f"map-{number}"
+            files += _draw(table, grid, (across, upwards), case.values, problem, path, formats)
+    return Shown(manifest.points, counts, switches, best, [out / path.name for path in files])
 
 
 def _chosen(grid: Grid, axes: Sequence[str] | None) -> tuple[int, int | None]:

@@ -132,7 +132,8 @@ def check_key(folder: Path, key: str) -> None:
         if read_manifest(folder).version != __version__
         else "another sweep, or other code or robots"
     )
-    raise OutputError(f"contains results of {other}", where=str(folder), hint="choose another `out`")
+    hint = "choose another `out`, or `force` to replace them"
+    raise OutputError(f"contains results of {other}", where=str(folder), hint=hint)
 
 
 def _read(folder: Path) -> tuple[str, Any]:

@@ -49,6 +49,7 @@ def run_sweep(
     folder: Path,
     executor: Executor | None = None,
     *,
+    force: bool = False,
     progress: Progress | None = None,
     in_hand: int = IN_HAND,
 ) -> SweepRun:
@@ -61,6 +62,7 @@ def run_sweep(
         folder: Folder of the results.  If the folder contains an unfinished run of the same sweep, this run continues
             it.
         executor: A ``concurrent.futures.Executor``; ``None`` to solve in this process.
+        force: Whether to replace results of another sweep or version in the folder.
         progress: Callback with the number of solved points and the number of all points to solve.  If shards have two
             passes (:attr:`Sweep.passes`), each point counts twice.
         in_hand: Maximum number of shards that are submitted at the same time.
@@ -74,7 +76,7 @@ def run_sweep(
     key = sweep_key(sweep)
     atlas = Atlas(folder, sweep, key)
     counts, shards, solver_s, total_s = dict.fromkeys(STATUS, 0), 0, 0.0, 0.0
-    with atlas.opened():
+    with atlas.opened(force):
         first, second = atlas.waiting()
         work = [(1, first, lambda shard: (solve_shard, sweep, key, shard)),
                 (2, second, lambda shard: (revise_shard, sweep, key, shard, *atlas.solved(shard)))]  # fmt: skip

@@ -1,7 +1,9 @@
-"""Write output folders completely or not at all, and never overwrite foreign files.
+"""Write output folders completely or not at all, and never overwrite files of the user without ``--force``.
 
-The file ``.impact-posture.json`` in an output folder, called the record, lists the files that were written into the
-folder.  Other files are called foreign.  ``--force`` replaces a folder only if it contains no foreign files.
+A file belongs to the user unless the record of its folder lists it with its SHA-256
+(:mod:`impact_posture.system.folder_record`).  :func:`whole_folder` makes a new folder.  ``--force`` replaces an
+existing folder, with all changes in it, but only if the folder contains no foreign files.  :func:`added_files` adds
+files to a folder.  ``--force`` replaces only the files with the same names.
 """
 
 from __future__ import annotations
@@ -11,21 +13,26 @@ import fcntl
 import json
 import os
 import secrets
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, Literal
 
 from impact_posture.errors import OutputError, listed
+from impact_posture.system.folder_record import (
+    Kind,
+    changed_files,
+    extended_record,
+    foreign_files,
+    is_own,
+    read_record,
+    write_record,
+)
 from impact_posture.system.processes import signals_held, undone
-from impact_posture.system.scratch_folder import RECORD, SCHEMA, SCRATCH, made_by, remove_scratch, scratch_folder
-from impact_posture.system.text_files import read_text
+from impact_posture.system.scratch_folder import RECORD, SCRATCH, remove_scratch, scratch_folder
 
 # Number of foreign files that a message names.
 _SHOWN = 3
 _EXISTS = "choose another `out`, or `force` to replace it"
-
-Kind = Literal["result", "export", "run", "comparison", "reproduction", "sweep", "world"]
 
 
 def check_output(out: Path, *, force: bool, kind: Kind) -> None:
@@ -47,7 +54,9 @@ def check_output(out: Path, *, force: bool, kind: Kind) -> None:
         raise OutputError("is a mount point", where=str(out), hint="choose a folder in it")
     if out.is_dir() and any(out.iterdir()):
         if not force:
-            raise OutputError("exists", where=str(out), hint=_EXISTS)
+            changed = changed_files(out)
+            edited = f", and it holds changes of yours in {listed(changed, _SHOWN)}" if changed else ""
+            raise OutputError(f"exists{edited}", where=str(out), hint=_EXISTS)
         _check_ours(out, kind)
     parent = next(folder for folder in out.absolute().parents if folder.exists())
     if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
@@ -84,9 +93,7 @@ def whole_folder(out: Path, *, force: bool, kind: Kind, products: Sequence[str] 
             try:
                 yield beside
             except OutputError as error:
-                # Name the final folder, because the user does not know the temporary folder.
-                where = error.where.replace(str(beside), str(out))
-                raise OutputError(error.what, where=where, hint=error.hint) from None
+                raise _renamed(error, beside, out) from None
             write_record(beside, kind, products)
             with signals_held():
                 _replace(beside, out, force, kind)
@@ -99,49 +106,90 @@ def whole_folder(out: Path, *, force: bool, kind: Kind, products: Sequence[str] 
         raise OutputError(fault, where=str(out), hint="free space or choose another `out`") from error
 
 
-def write_record(folder: Path, kind: Kind, products: Sequence[str] = ()) -> None:
-    """Write the record of a folder: all its files, and ``products``, which may be built later.
+@contextmanager
+def added_files(folder: Path, *, force: bool) -> Iterator[Path]:
+    """Yield a temporary folder; after the block, its files move to ``folder`` and into the record of ``folder``.
+
+    An existing file is replaced if this program wrote it and nobody changed it, or if ``force`` is true.  Otherwise,
+    and after any error, all files of ``folder`` stay as they were.
 
     Raises:
-        OSError: The record cannot be written.
+        OutputError: A file of the user would be replaced, or ``folder`` cannot be written.
     """
-    files = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir())
-    content = {"schema": SCHEMA, "kind": kind, "files": files, "products": sorted(products), **made_by()}
-    write_json(folder / RECORD, content)
-
-
-def typed_command(folder: Path) -> str:
-    """Return the command line that wrote an output folder; empty if another program wrote the folder."""
+    check_name(folder)
+    out = folder.absolute()
     try:
-        return str(json.loads(read_text(folder / RECORD)).get("command", ""))
-    except (OSError, ValueError, AttributeError, RecursionError):
-        return ""
+        with parents_of(out / RECORD), scratch_folder(out) as beside:
+            new, old = beside / "new", beside / "old"
+            new.mkdir()
+            old.mkdir()
+            try:
+                yield new
+            except OutputError as error:
+                raise _renamed(error, new, folder) from None
+            names = sorted(os.listdir(new))
+            with used_alone(folder, out), signals_held():
+                (new / RECORD).write_text(extended_record(folder, new), encoding="utf-8")
+                _move([*names, RECORD], new, folder, old, force)
+    except OSError as error:
+        raise OutputError.unwritable(folder, error, "free space or choose another folder") from error
 
 
-def is_ours(folder: Path, kind: Kind) -> bool:
-    """Return whether ``kind`` is in the record of a folder.  The folder may also contain foreign files."""
-    content = _read_record(folder)
-    return content is not None and content["kind"] == kind
+def _move(names: Sequence[str], new: Path, out: Path, old: Path, force: bool) -> None:
+    """Move all files from ``new`` to ``out``, or none.  ``old`` gets links to the replaced files."""
+    for name in names:
+        if os.path.lexists(out / name):
+            _check_replaceable(out, name, out / name, force)
+    moved = []
+    try:
+        for name in names:
+            _place(new / name, out / name, old / name)
+            moved.append(name)
+            if os.path.lexists(old / name):
+                # Check again, because the file may have been changed since the first check.
+                _check_replaceable(out, name, old / name, force)
+    except BaseException:
+        for name in moved:
+            if os.path.lexists(old / name):
+                os.replace(old / name, out / name)
+            else:
+                os.unlink(out / name)
+        raise
 
 
-def own_files(folder: Path, kind: Kind) -> list[str]:
-    """Return the files in the record of a folder, without the record itself; empty for a record of another kind."""
-    content = _read_record(folder)
-    return [] if content is None or content["kind"] != kind else [name for name in content["files"] if name != RECORD]
+def _place(new: Path, target: Path, old: Path) -> None:
+    """Move the file ``new`` to ``target``; if a file exists there, the link ``old`` keeps it."""
+    if os.path.lexists(target):
+        _link(target, old)
+        os.replace(new, target)
+    else:
+        _link(new, target)
 
 
-def add_to_record(folder: Path, paths: Iterable[Path]) -> None:
-    """Add files to the record of a folder; do nothing if the folder has no record.
+def _check_replaceable(folder: Path, name: str, path: Path, force: bool) -> None:
+    """Raise an error if the file ``name`` of a folder must not be replaced; ``path`` is where the file is now."""
+    where = str(folder / name)
+    if path.is_dir() and not path.is_symlink():
+        raise OutputError("is a folder", where=where, hint="move it away, or choose another folder")
+    if not force and not is_own(folder, name, path):
+        fault = "was not written by this program, or was changed since"
+        raise OutputError(fault, where=where, hint="choose another folder, or `force` to replace it")
 
-    Raises:
-        OutputError: The record cannot be written.
-    """
-    content = _read_record(folder)
-    if content is None:
-        return
-    added = {path.absolute().relative_to(folder.absolute()).as_posix() for path in paths}
-    content["files"] = sorted(added.union(content["files"]))
-    write_whole(folder / RECORD, json.dumps(content, indent=1) + "\n")
+
+def _link(source: Path, target: Path) -> None:
+    """Make a hard link, which never replaces a file; move the file if the file system has no hard links."""
+    try:
+        os.link(source, target, follow_symlinks=False)
+    except FileExistsError:
+        hint = "run the command again"
+        raise OutputError("was written by another program meanwhile", where=str(target), hint=hint) from None
+    except OSError:
+        os.rename(source, target)
+
+
+def _renamed(error: OutputError, temporary: Path, final: Path) -> OutputError:
+    """Return the error with the final folder, because the user does not know the temporary folder."""
+    return OutputError(error.what, where=error.where.replace(str(temporary), str(final)), hint=error.hint)
 
 
 def write_json(path: Path, document: object) -> None:
@@ -173,43 +221,15 @@ def write_whole(path: Path, content: str | bytes) -> None:
 
 
 def _check_ours(out: Path, kind: Kind) -> None:
-    content = _read_record(out)
-    if content is not None and content["kind"] != kind:
+    content = read_record(out)
+    if content is not None and content["kind"] not in (kind, "pictures"):
         fault = f"holds another command's results ({content['kind']})"
         raise OutputError(fault, where=str(out), hint="choose another `out`")
-    foreign = _foreign(out, set())
+    foreign = foreign_files(out)
     if foreign:
         fault = f"holds {listed(foreign, _SHOWN)}, which this command did not write"
         hint = "choose another `out`, or move that away: `force` replaces earlier results only"
         raise OutputError(fault, where=str(out), hint=hint)
-
-
-def _foreign(folder: Path, ours: set[str], below: str = "") -> list[str]:
-    """Return the names in a folder that are neither in ``ours`` nor in the record of the folder, sorted."""
-    content = _read_record(folder)
-    names = [] if content is None else [RECORD, *content["files"], *content["products"]]
-    ours = ours.union(below + name for name in names)
-    foreign = []
-    for entry in sorted(os.scandir(folder), key=lambda e: e.name):
-        name = below + entry.name
-        if entry.is_dir(follow_symlinks=False):
-            inside = any(path.startswith(f"{name}/") for path in ours) and not os.path.ismount(entry.path)
-            foreign += _foreign(Path(entry.path), ours, f"{name}/") if inside else [f"{name}/"]
-        elif name not in ours or not entry.is_file(follow_symlinks=False):
-            foreign.append(name)
-    return foreign
-
-
-def _read_record(folder: Path) -> dict[str, Any] | None:
-    try:
-        content = json.loads(read_text(folder / RECORD)) if (folder / RECORD).is_file() else None
-    except (OSError, ValueError, RecursionError):
-        return None
-    if not isinstance(content, dict) or content.get("schema") != SCHEMA:
-        return None
-    lists = [content.get("files"), content.get("products")]
-    sound = all(isinstance(names, list) and all(isinstance(name, str) for name in names) for names in lists)
-    return content if sound and isinstance(content.get("kind"), str) else None
 
 
 def _replace(beside: Path, out: Path, force: bool, kind: Kind) -> None:

@@ -13,32 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from impact_posture.api.posture_problem import PostureProblem
-from impact_posture.api.posture_result import PostureResult
-from impact_posture.output import plot
-from impact_posture.posture.formulation.problem_file import prepare
-from impact_posture.posture.search.multistart import solve
-from tests.hostile.arena import SMALL, attack, strike
-from tests.support.settings import make_settings
+from tests.hostile.arena import attack, strike
 
 STOP = ("--out", "precious", "--force")
 COUNT = 8
-
-
-@pytest.fixture(scope="module")
-def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A result folder without figures."""
-    place = tmp_path_factory.mktemp("result")
-    (place / "small.urdf").write_text(SMALL)
-    prepared = prepare(make_settings({
-        "robot": str(place / "small.urdf"), "frame": "tip", "normal": (1.0, 0.0, 0.0), "contact_pose": "free",
-    }))  # fmt: skip
-    solution = solve(prepared.problem, starts=1, compile="never")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(plot, "draw_all", lambda *_: [])
-        result = PostureResult(PostureProblem.of(prepared), solution)
-        result.save(place / "out", codegen=False, report=False, jobs=1)
-    return place / "out"
 
 
 def spoil_document(folder: Path, rng: random.Random) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import shutil
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -326,16 +325,6 @@ def test_points_out_of_reach_are_infeasible_and_others_avoid_the_wall(tmp_path: 
     solve(f"{problem}[grid]\nx = [2.0, 0.0]\ny = {y}", tmp_path)
     rows = ip.sweep.open(tmp_path / "out").to_table().sort_by("point").to_pylist()
     assert [row["status"] for row in rows] == ["infeasible"] * len(y) + ["certified"] * len(y)
-
-
-def test_a_folder_without_manifest_is_continued(tmp_path: Path) -> None:
-    folder = tmp_path / "out"
-    solve(AERIAL, tmp_path)
-    wanted = shards(folder)
-    (folder / "manifest.json").unlink()
-    shutil.rmtree(folder / "data")
-    solve(AERIAL, tmp_path)
-    assert shards(folder) == wanted
 
 
 def test_a_folder_of_another_sweep_is_refused(aerial: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from matplotlib.figure import Figure
@@ -23,7 +25,9 @@ from impact_posture.output.result_reader import load_view
 from impact_posture.robot.posture_files import read_posture
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.simulation.scenario_file import read_scenario
-from impact_posture.system.output_folder import Kind, add_to_record, check_output, whole_folder, write_whole
+from impact_posture.system import output_folder
+from impact_posture.system.folder_record import Kind
+from impact_posture.system.output_folder import added_files, check_output, whole_folder, write_whole
 from impact_posture.system.scratch_folder import RECORD, SCRATCH, scratch_folder
 
 
@@ -102,9 +106,141 @@ def test_files_that_are_added_to_the_record_are_replaced(tmp_path: Path) -> None
     (tmp_path / "out" / "jump.svg").write_text("a picture")
     with pytest.raises(OutputError, match=r"jump\.svg"):
         write(tmp_path / "out", "two", force=True)
-    add_to_record(tmp_path / "out", [tmp_path / "out" / "jump.svg"])
+    with added_files(tmp_path / "out", force=True) as beside:
+        (beside / "jump.svg").write_text("another picture")
+    assert content(tmp_path / "out")["jump.svg"] == "another picture"
     write(tmp_path / "out", "two", force=True)
     assert content(tmp_path / "out")["result.json"] == "two"
+
+
+# ---- files that are added to a folder ------------------------------------------------------------------------------
+
+
+def add(out: Path, text: str, *, force: bool = False) -> None:
+    with added_files(out, force=force) as beside:
+        for name in ("a.svg", "b.svg"):
+            (beside / name).write_text(text)
+
+
+def state(folder: Path) -> dict[str, tuple[int, int]]:
+    """Return inode and time of each file.  Both stay the same only if a file is neither replaced nor written."""
+    paths = (path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())
+    return {str(path): (path.lstat().st_ino, path.lstat().st_mtime_ns) for path in paths}
+
+
+def edit(path: Path) -> None:
+    path.write_text(path.read_text() + "a note")
+
+
+def link_to_thesis(path: Path) -> None:
+    path.unlink()
+    path.symlink_to(path.parents[1] / "thesis.txt")
+
+
+def make_pipe(path: Path) -> None:
+    path.unlink()
+    os.mkfifo(path)
+
+
+@pytest.mark.parametrize("change", [edit, link_to_thesis, make_pipe])
+@pytest.mark.parametrize("recorded", [True, False])
+def test_changed_files_are_only_replaced_by_force(
+    change: Callable[[Path], None], recorded: bool, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    (tmp_path / "thesis.txt").write_text("ten years")
+    if recorded:
+        write(out, "old")
+    add(out, "old")
+    add(out, "newer")
+    assert (out / "a.svg").read_text() == "newer"
+    change(out / "b.svg")
+    before = state(tmp_path)
+    with pytest.raises(OutputError, match=r"out/b\.svg: was not written by this program, or was changed.*`force`"):
+        add(out, "new")
+    assert state(tmp_path) == before
+    add(out, "new", force=True)
+    add(out, "newest")
+    assert (out / "b.svg").read_text() == "newest" and not (out / "b.svg").is_symlink()
+    assert (tmp_path / "thesis.txt").read_text() == "ten years"
+    assert sorted(os.listdir(out)) == sorted([RECORD, "a.svg", "b.svg", *(["c", "result.json"] if recorded else [])])
+
+
+def test_a_folder_with_the_name_of_a_file_is_kept(tmp_path: Path) -> None:
+    (tmp_path / "out" / "b.svg").mkdir(parents=True)
+    with pytest.raises(OutputError, match=r"b\.svg: is a folder"):
+        add(tmp_path / "out", "new", force=True)
+    assert os.listdir(tmp_path / "out") == ["b.svg"]
+
+
+def test_a_file_that_appears_meanwhile_is_not_replaced(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with (
+        pytest.raises(OutputError, match=r"b\.svg: was not written by this program"),
+        added_files(out, force=False) as new,
+    ):
+        for name in ("a.svg", "b.svg"):
+            (new / name).write_text("new")
+        (out / "b.svg").write_text("mine")
+    assert content(out) == {"b.svg": "mine"}
+
+
+@pytest.mark.parametrize("fault", [OSError, KeyboardInterrupt])
+@pytest.mark.parametrize("at", [0, 1, 2])
+@pytest.mark.parametrize("links", [True, False])
+def test_all_files_are_replaced_or_none(
+    fault: type[BaseException], at: int, links: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    write(out, "old")
+    add(out, "old")
+    (out / "a.svg").unlink()
+    before, place, calls = state(tmp_path), output_folder._place, []
+
+    def fail_late(*arguments: Any) -> None:
+        calls.append(arguments)
+        if len(calls) > at:
+            raise fault
+        place(*arguments)
+
+    def no_links(*_: object, **__: object) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr(output_folder, "_place", fail_late)
+    if not links:
+        monkeypatch.setattr(os, "link", no_links)
+    with pytest.raises((OutputError, KeyboardInterrupt)):
+        add(out, "new")
+    assert state(tmp_path) == before
+
+
+def test_files_in_a_record_without_hashes_count_as_ours(tmp_path: Path) -> None:
+    """Version 0.2 wrote no hashes, so it is unknown whether somebody changed a file that it lists."""
+    out = tmp_path / "out"
+    write(out, "old")
+    add(out, "old")
+    old = json.loads((out / RECORD).read_text())
+    del old["sha256"]
+    (out / RECORD).write_text(json.dumps(old))
+    edit(out / "a.svg")
+    add(out, "new")
+    edit(out / "a.svg")
+    with pytest.raises(OutputError, match=r"a\.svg"):
+        add(out, "newer")
+
+
+def test_a_changed_file_is_named_before_a_folder_is_replaced(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    write(out, "old")
+    edit(out / "c" / "a.c")
+    with pytest.raises(OutputError, match=r"exists, and it holds changes of yours in c/a\.c; .*`force`"):
+        write(out, "new")
+    write(out, "new", force=True)
+    # A part with a newer record of its own is not changed.
+    shutil.rmtree(out / "c")
+    write(out / "c", "newer")
+    with pytest.raises(OutputError, match="exists;"):
+        write(out, "newest")
 
 
 def test_a_foreign_file_that_appears_meanwhile_is_kept(tmp_path: Path) -> None:

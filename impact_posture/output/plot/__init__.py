@@ -28,6 +28,7 @@ from impact_posture.output.plot.result_view import ResultView, TradeOffData
 from impact_posture.output.plot.run_figures import figures_of_comparison, figures_of_run
 from impact_posture.output.plot.run_view import RunView
 from impact_posture.output.plot.style import DEFAULT_FORMATS, FORMATS, check_formats, save, save_all
+from impact_posture.system.output_folder import added_files
 
 __all__ = [
     "FIGURES",
@@ -39,6 +40,7 @@ __all__ = [
     "TradeOffData",
     "bars_figure",
     "draw_all",
+    "draw_into",
     "drawable",
     "figures_of_comparison",
     "figures_of_run",
@@ -98,3 +100,17 @@ def draw_all(
         if name not in FIGURES:
             raise FigureNotFound(name, FIGURES, where="plot")
     return [path for name in names for path in save(FIGURES[name](view), out, name, wanted)]
+
+
+def draw_into(
+    view: ResultView, out: Path, formats: Iterable[str], only: Collection[str] | None = None, *, force: bool = False
+) -> list[Path]:
+    """Write figures as :func:`draw_all`, but replace files of the user only if ``force`` is true.
+
+    Raises:
+        OutputError: A file of the user has the name of a figure, or the folder cannot be written.
+        InputError: As for :func:`draw_all`.
+    """
+    with added_files(out, force=force) as beside:
+        written = draw_all(view, beside, formats, only)
+    return [out / path.name for path in written]

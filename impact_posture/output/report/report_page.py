@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cache
 from itertools import groupby
@@ -17,7 +18,7 @@ from impact_posture.errors import printable
 from impact_posture.output.plot.result_view import number
 from impact_posture.output.report import REPORT
 from impact_posture.output.report.report_scene import ReportScene, Track, zipped
-from impact_posture.system.output_folder import write_whole
+from impact_posture.system.output_folder import added_files, write_whole
 from impact_posture.version import __version__
 
 _VIEWER = Path(__file__).parent / "viewer"
@@ -60,13 +61,18 @@ class Content:
     sources: tuple[tuple[str, str], ...] = ()
 
 
-def write_page(folder: Path, content: Content, scene: ReportScene) -> Path:
+def write_page(folder: Path, content: Content, scene: ReportScene, force: bool | None = None) -> Path:
     """Write ``report.html`` into a folder; return its path.  The page contains the figures in the folder.
 
+    ``force`` is ``None`` for a new folder.  In another folder, ``force`` says whether the page may replace a file of
+    the user.
+
     Raises:
-        OutputError: The page cannot be written.
+        OutputError: The page would replace a file of the user, or cannot be written.
     """
-    write_whole(folder / REPORT, render(content, scene, figures(folder)))
+    page = render(content, scene, figures(folder))
+    with nullcontext(folder) if force is None else added_files(folder, force=force) as into:
+        write_whole(into / REPORT, page)
     return folder / REPORT
 
 

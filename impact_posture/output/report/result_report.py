@@ -21,7 +21,7 @@ from impact_posture.output.report.report_page import Content, Table, figures, re
 from impact_posture.output.report.report_scene import Curve, ReportScene, Track, impact_curves
 from impact_posture.posture.formulation.problem_file import Prepared
 from impact_posture.system.arrays import Array
-from impact_posture.system.output_folder import typed_command
+from impact_posture.system.folder_record import typed_command
 from impact_posture.system.scratch_folder import scratch_folder
 
 # Maximum number of frames of a motion over time.
@@ -36,17 +36,18 @@ def write_result_report(
     *,
     meshes: bool = False,
     scene: ReportScene | None = None,
+    force: bool | None = None,
 ) -> Path:
     """Write ``report.html`` of a result, which contains ``problem.toml`` and the figures; return its path.
 
     ``document`` is the content of ``result.json``.  ``scene`` is an earlier return value of :func:`result_scene`.  If
-    ``meshes`` is true, the report may contain the meshes of the user's URDF.
+    ``meshes`` is true, the report may contain the meshes of the user's URDF.  ``force`` is as in :func:`write_page`.
 
     Raises:
         OutputError: The report cannot be written.
     """
     scene = scene or result_scene(prepared, view, meshes)
-    return write_page(folder, _content(folder, prepared, view, document), scene)
+    return write_page(folder, _content(folder, prepared, view, document), scene, force)
 
 
 def result_summary(prepared: Prepared, view: ResultView, document: dict[str, Any]) -> str:
