@@ -14,10 +14,10 @@ SIGNATURES: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "jump": (("q", "n"), ("a", "G", "V")),
     "ellipsoid": (("q",), ("L",)),
 }
-"""C function → its inputs and its results, in the order of the parameters.  The batch function is not included."""
+"""C function → its inputs and its results, in the order of the parameters.  Batch functions are not included."""
 
 
-FUNCTIONS = (*SIGNATURES, "eval_batch")
+FUNCTIONS = (*SIGNATURES, "eval_batch", "objective_batch")
 """Names of the functions that each frame has; the C names are ``<stem>_<function>``."""
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,6 +27,8 @@ _TYPES: dict[str, Any] = {"double": ctypes.c_double, "float": ctypes.c_float}
 # Relative tolerance for rounding errors in the comparison with the reference values of the manifest.  In float, few
 # of the seven digits are correct if the robot has supports with compliance ε (condition number about 1/ε).
 _SELF_TEST = {"double": 1e-7, "float": 0.1}
+# Fewest rows of a batch for which a thread is started.
+_LEAST_ROWS = 256
 
 
 class ImpactGradient:
@@ -50,6 +53,7 @@ class ImpactGradient:
         nq: Length of a configuration.
         nv: Length of a gradient.
         dtype: NumPy type of the numbers in the library.
+        symbols: Name of a function in the manifest → its C name for this frame.
     """
 
     def __init__(
@@ -77,7 +81,10 @@ class ImpactGradient:
             arguments = [ctypes.byref(buffer) for buffer in (*[inputs[key] for key in input_names], *buffers)]
             views = tuple(np.frombuffer(buffer, dtype=self.dtype) for buffer in buffers)
             self._functions[name] = partial(getattr(library, symbols[name]), *arguments), views
-        self._batch = getattr(library, symbols["eval_batch"])
+        # Exports of earlier versions have no batch of the objective.
+        names = {"eval": symbols["eval_batch"], "objective": symbols.get("objective_batch")}
+        self._batches = {name: getattr(library, symbol) for name, symbol in names.items() if symbol}
+        self.symbols = symbols
 
     @classmethod
     @checked
@@ -196,33 +203,66 @@ class ImpactGradient:
         return self._results("ellipsoid", q)[0].reshape(3, 3)
 
     def value_and_gradient_batch(
-        self, q: ArrayLike, n: ArrayLike, out: tuple[Array, Array] | None = None
+        self, q: ArrayLike, n: ArrayLike, out: tuple[Array, Array] | None = None, *, threads: int = 1
     ) -> tuple[Array, Array]:
         """Return ``H``, shape (N,), and tangent gradients, shape (N, nv), for N configurations.
 
         ``q`` has shape (N, nq).  ``n`` has shape (N, 3), or (3,) if all configurations have the same normal.  ``out``
         can provide two contiguous arrays of type :attr:`dtype` for the results; by default, new arrays are returned.
-        If a configuration is invalid, its rows are NaN; the rows of all other configurations are valid.
+        If a configuration is invalid, its rows are NaN; the rows of all other configurations are valid.  The rows are
+        divided among ``threads`` threads.
 
         Raises:
             InputError: A shape or a type is wrong.
         """
+        q = self._rows(q)
+        n = np.asarray(n, dtype=self.dtype)
+        if n.shape not in ((3,), (len(q), 3)):
+            raise InputError(f"has shape {n.shape}", where="n", hint=f"give shape (3,) or ({len(q)}, 3)")
+        n = np.ascontiguousarray(np.broadcast_to(n, (len(q), 3)))
+        return self._batch("eval", (q, n), out, threads)
+
+    def objective_batch(
+        self, q: ArrayLike, out: tuple[Array, Array] | None = None, *, threads: int = 1
+    ) -> tuple[Array, Array]:
+        """Return the objective, shape (N,), and its tangent gradients, as :meth:`value_and_gradient_batch` does.
+
+        Raises:
+            InputError: A shape or a type is wrong.
+            SpecError: An earlier version wrote the export, without this function.
+        """
+        if "objective" not in self._batches:
+            raise SpecError("has no objective_batch", where=str(self.manifest["prefix"]), hint="run codegen again")
+        return self._batch("objective", (self._rows(q),), out, threads)
+
+    def _rows(self, q: ArrayLike) -> Array:
         q = np.ascontiguousarray(q, dtype=self.dtype)
         if q.ndim != 2 or q.shape[1] != self.nq:
             raise InputError(f"has shape {q.shape}", where="q", hint=f"give shape (N, {self.nq})")
-        count = q.shape[0]
-        n = np.asarray(n, dtype=self.dtype)
-        if n.shape not in ((3,), (count, 3)):
-            raise InputError(f"has shape {n.shape}", where="n", hint=f"give shape (3,) or ({count}, 3)")
-        n = np.ascontiguousarray(np.broadcast_to(n, (count, 3)))
-        H, grad = (np.empty(count, self.dtype), np.empty((count, self.nv), self.dtype)) if out is None else out
-        for array, shape in ((H, (count,)), (grad, (count, self.nv))):
+        return q
+
+    def _batch(
+        self, name: str, inputs: tuple[Array, ...], out: tuple[Array, Array] | None, threads: int
+    ) -> tuple[Array, Array]:
+        count, call = len(inputs[0]), self._batches[name]
+        value, grad = (np.empty(count, self.dtype), np.empty((count, self.nv), self.dtype)) if out is None else out
+        for array, shape in ((value, (count,)), (grad, (count, self.nv))):
             if array.shape != shape or array.dtype != self.dtype or not array.flags.carray:
                 hint = f"give contiguous arrays of {self.dtype}, shapes ({count},) and ({count}, {self.nv})"
                 raise InputError(f"has shape {array.shape} of {array.dtype}", where="out", hint=hint)
-        pointers = [ctypes.c_void_p(array.ctypes.data) for array in (q, n, H, grad)]
-        self._batch(pointers[0], pointers[1], ctypes.c_int(count), pointers[2], pointers[3])
-        return H, grad
+
+        def part(first: int, last: int) -> None:
+            arrays = [ctypes.c_void_p(array[first:last].ctypes.data) for array in (*inputs, value, grad)]
+            call(*arrays[: len(inputs)], ctypes.c_int(last - first), *arrays[len(inputs) :])
+
+        # Each thread computes one contiguous part, because ctypes releases the interpreter lock during a call.
+        bounds = np.linspace(0, count, max(1, min(threads, count // _LEAST_ROWS)) + 1).astype(int)
+        if len(bounds) == 2:
+            part(0, count)
+        else:
+            with ThreadPoolExecutor(len(bounds) - 1) as pool:
+                list(pool.map(part, bounds[:-1], bounds[1:]))
+        return value, grad
 
     def _self_test(self, where: str) -> None:
         test = self._reference

@@ -105,7 +105,7 @@ def _joint_block(objective: WorstCaseObjective, stem: str, real: Real) -> dict[s
     return {
         "contacts": contacts,
         "bilateral": objective.bilateral,
-        "symbols": {"objective": f"{stem}_objective"},
+        "symbols": {name: f"{stem}_{name}" for name in ("objective", "objective_batch")},
         "self_test": self_test(objective, real),
     }
 

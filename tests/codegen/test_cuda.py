@@ -58,28 +58,34 @@ def on_host(written: Export, objectives: list[WorstCaseObjective]) -> ctypes.CDL
     prefix, real = written.prefix, written.manifest["real"]
     lines = [WORDS, "namespace device {", f'#include "{written.out / prefix}.cuh"', "}", 'extern "C" {']
     for symbol in written.functions:
-        stem, _, name = symbol.rpartition("_")
-        if name != "batch":
-            inputs, results = SIGNATURES[name]
-            parameters = ", ".join([f"const {real} *{v}" for v in inputs] + [f"{real} *{v}" for v in results])
-            lines.append(f"int {symbol}({parameters}) {{ return device::{symbol}({', '.join(inputs + results)}); }}")
+        function = symbol.removesuffix("_batch")
+        name = function.rpartition("_")[2]
+        inputs, results = SIGNATURES[name]
+        arrays = [f"const {real} *{v}" for v in inputs] + [f"{real} *{v}" for v in results]
+        if function == symbol:
+            call = f"device::{symbol}({', '.join(inputs + results)})"
+            lines.append(f"int {symbol}({', '.join(arrays)}) {{ return {call}; }}")
             continue
+        arrays.insert(len(inputs), "int count")
+        normals = ["n", "count"] if "n" in inputs else []
         lines.append(f"""
-int {symbol}(const {real} *q, const {real} *n, int count, {real} *H, {real} *grad)
+int {symbol}({", ".join(arrays)})
 {{
   // One block of one thread computes all rows.
   blockIdx.x = threadIdx.x = 0;
   gridDim.x = 1;
-  device::{stem}_kernel<1>(q, n, count, count, H, grad, nullptr);
+  device::{function}_kernel<1>({", ".join(["q", *normals, "count", *results])}, nullptr);
   return 0;
-}}
-void {stem}_rows(const {real} *q, const {real} *n, int count, {real} *H, {real} *grad, int *status)
+}}""")
+        if normals:
+            lines.append(f"""
+void {function}_rows(const {real} *q, const {real} *n, int count, {real} *H, {real} *grad, int *status)
 {{
   // More threads than rows; the last threads must not write anything.
   gridDim.x = 2;
   for (blockIdx.x = 0; blockIdx.x < 2; ++blockIdx.x) {{
     for (threadIdx.x = 0; threadIdx.x < 2; ++threadIdx.x) {{
-      device::{stem}_kernel<2>(q, n, 1, count, H, grad, status);
+      device::{function}_kernel<2>(q, n, 1, count, H, grad, status);
     }}
   }}
 }}""")
