@@ -32,6 +32,9 @@ if TYPE_CHECKING:
     from impact_posture.controller_export.compiled_controller import CompiledController as CompiledController
     from impact_posture.controller_export.export_controller import export_controller as export_controller
     from impact_posture.errors import ImpactPostureError as ImpactPostureError
+    from impact_posture.frameworks import gpu as gpu
+    from impact_posture.frameworks import jax_metric as jax  # noqa: F401
+    from impact_posture.frameworks import torch_metric as torch  # noqa: F401
     from impact_posture.impact.impact_contact import ImpactContact as ImpactContact
     from impact_posture.impact.metric import Metric as Metric
     from impact_posture.robot.robot import Robot as Robot
@@ -40,6 +43,14 @@ if TYPE_CHECKING:
     from impact_posture.robot.robot_spec import Support as Support
 
 
+# Names of modules → where they are.
+_MODULES = {
+    "gpu": "frameworks.gpu",
+    "jax": "frameworks.jax_metric",
+    "sweep": "sweep",
+    "torch": "frameworks.torch_metric",
+    "tsid": "tsid",
+}
 _HOMES = {
     "CompiledController": "controller_export.compiled_controller",
     "Export": "codegen.export",
@@ -56,20 +67,17 @@ _HOMES = {
     "known_robots": "robot.robot_loader",
     "load_robot": "robot.robot_loader",
     "optimize": "api.posture_result",
-    "sweep": "",
-    "tsid": "",
 }
 
-__all__ = ["__version__", *_HOMES]
+__all__ = ["__version__", *_HOMES, *_MODULES]
 
 
 def __getattr__(name: str) -> Any:
+    if name in _MODULES:
+        return import_module(f"impact_posture.{_MODULES[name]}")
     if name not in _HOMES:
         raise AttributeError(f"module 'impact_posture' has no attribute '{name}'")
-    home = _HOMES[name]
-    if not home:
-        return import_module(f"impact_posture.{name}")
-    return getattr(import_module(f"impact_posture.{home}"), name)
+    return getattr(import_module(f"impact_posture.{_HOMES[name]}"), name)
 
 
 def __dir__() -> list[str]:

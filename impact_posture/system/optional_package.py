@@ -10,13 +10,17 @@ from typing import Any
 from impact_posture.errors import InputError
 
 
-def import_extra(module: str, extra: str, name: str = "") -> Any:
-    """Return a module; raise InputError with the pip command if its package (``name``) is not installed."""
+def import_extra(module: str, extra: str = "", name: str = "") -> Any:
+    """Return a module; raise InputError with the pip command if its package (``name``) is not installed.
+
+    Without ``extra``, no extra of this package installs the module.
+    """
     try:
         return import_module(module)
     except ImportError:
-        hint = f"pip install 'impact-posture[{extra}]'"
-        raise InputError(f"{name or module} is not installed", where=f"the extra '{extra}'", hint=hint) from None
+        hint = f"pip install 'impact-posture[{extra}]'" if extra else f"pip install {module}"
+        where = f"the extra '{extra}'" if extra else "import"
+        raise InputError(f"{name or module} is not installed", where=where, hint=hint) from None
 
 
 def import_mujoco() -> Any:

@@ -120,6 +120,23 @@ def test_batches(loaded: Loaded, count: int) -> None:
     assert written[0] is out[0] and written[1] is out[1]
     for k in range(min(count, 8)):
         assert out[0][k] == pytest.approx(gradient.value(q[k], UNIT), rel=1e-5)
+    values, rows = gradient.objective_batch(q)
+    for k in range(count):
+        value, row = gradient.objective(q[k])
+        assert values[k] == value and rows[k].tolist() == row.tolist()
+
+
+def test_exports_of_earlier_versions_lack_a_batch_of_the_objective(loaded: Loaded) -> None:
+    gradient = loaded.gradient
+    frames = [
+        {**f, "symbols": {k: v for k, v in f["symbols"].items() if k != "objective_batch"}}
+        for f in gradient.manifest["frames"]
+    ]
+    earlier = ImpactGradient(gradient._library, {**gradient.manifest, "frames": frames})
+    q = loaded.objectives[0].robot.posture()
+    assert earlier.objective(q)[0] == gradient.objective(q)[0]
+    with pytest.raises(SpecError, match="run codegen again"):
+        earlier.objective_batch(q[None])
 
 
 def test_a_bad_row_spoils_no_other(loaded: Loaded) -> None:

@@ -1,0 +1,198 @@
+"""Batches of H and the objective on all CPU cores, or on a GPU if the arrays are there.  CasADi is not needed.
+
+Arrays of every package with the DLPack protocol are accepted: NumPy, CuPy, PyTorch, JAX.  A GPU needs CuPy
+(``impact-posture[cuda]``) and an export with ``--cuda``.  CuPy compiles the kernels with NVRTC at their first call.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from impact_posture.codegen.impact_gradient import ImpactGradient
+from impact_posture.errors import InputError
+from impact_posture.system.optional_package import import_extra
+
+if TYPE_CHECKING:
+    from impact_posture.robot.robot import Robot
+
+# DLPack's number of a CUDA device.
+_CUDA = 2
+# Threads of a block.  On an H100, 128 threads are the fastest for all studied robots.
+_THREADS = 128
+# Last words of the names of a joint's entries in q → how many entries it has in ν.
+_JOINTS = {
+    ("x (m)", "y (m)", "z (m)", "qx", "qy", "qz", "qw"): 6,
+    ("x (m)", "y (m)", "cos", "sin"): 3,
+    ("qx", "qy", "qz", "qw"): 3,
+    ("cos", "sin"): 1,
+}
+
+
+def load(
+    path: str | Path, *, robot: Robot | None = None, frame: str | None = None, free: bool = False
+) -> BatchMetric:
+    """Load an export for batches; arguments and errors are as in :meth:`ImpactGradient.load`.
+
+    Loading runs the code of the export.
+    """
+    folder = Path(path) if Path(path).is_dir() else Path(path).parent
+    return BatchMetric(ImpactGradient.load(path, robot=robot, frame=frame, free=free), folder)
+
+
+class BatchMetric:
+    """``H`` and the objective of an export, with gradients, for many configurations.
+
+    The results are arrays of the package, number type and device of ``q``.  If ``q`` is on the CPU, the C code
+    computes the rows on all cores.  If ``q`` is on an NVIDIA GPU, the CUDA code computes the rows there.  The rows of
+    a configuration that fails are NaN.
+
+    By default, gradients are **tangent** gradients, shape (N, nv): entry i is the derivative along ``ν_i``.  For a
+    floating base, the first six entries are for the linear and angular velocity in base axes.  With ``in_q``,
+    gradients are derivatives with respect to the **entries of q**, shape (N, nq), and ``q`` need not be normalized.
+    The function is then ``H(u(q))``, where ``u`` divides every quaternion and every cosine-sine pair by its norm.
+    For a robot without quaternions and cosine-sine pairs, both gradients are equal.
+
+    Attributes:
+        gradient: The functions for a single configuration.
+    """
+
+    def __init__(self, gradient: ImpactGradient, folder: Path) -> None:
+        """Use a loaded export; ``folder`` contains its CUDA code, if there is any."""
+        self.gradient, self._folder = gradient, folder
+        self._joints = tuple(_joints(gradient.manifest["q_names"]))
+        self._kernels: dict[str, Any] = {}
+
+    def value_and_gradient(self, q: Any, n: Any, *, in_q: bool = False) -> tuple[Any, Any]:
+        """Return ``H``, shape (N,), and its gradients for configurations ``q``, shape (N, nq).
+
+        ``n`` is the unit normal out of the surface, shape (3,) or (N, 3), in the axes that the key ``normal_frame``
+        of the manifest names.
+
+        Raises:
+            InputError: A shape is wrong, CuPy is not installed, or the export has no CUDA code.
+        """
+        return self._call("eval", q, n, in_q)
+
+    def objective(self, q: Any, *, in_q: bool = False) -> tuple[Any, Any]:
+        """Return the objective of the export, shape (N,), and its gradients.
+
+        Raises:
+            InputError: As in :meth:`value_and_gradient`.
+            SpecError: An earlier version wrote the export, without a batch of the objective.
+        """
+        return self._call("objective", q, None, in_q)
+
+    def _call(self, name: str, q: Any, n: Any, in_q: bool) -> tuple[Any, Any]:
+        package, on_gpu = _package(q), _on_gpu(q)
+        xp = import_extra("cupy", "cuda", "CuPy") if on_gpu else np
+        with xp.cuda.Device(q.__dlpack_device__()[1]) if on_gpu else nullcontext():
+            given = _to(xp, q)
+            rows = xp.ascontiguousarray(given, dtype=self.gradient.dtype)
+            if rows.ndim != 2 or rows.shape[1] != self.gradient.nq:
+                raise InputError(f"has shape {rows.shape}", where="q", hint=f"give shape (N, {self.gradient.nq})")
+            scales = None
+            if in_q:
+                rows, scales = self._normalized(xp, rows)
+            inputs = (rows,) if n is None else (rows, xp.asarray(_to(xp, n), dtype=self.gradient.dtype))
+            value, grad = self._launch(xp, name, *inputs) if on_gpu else self._on_cores(name, *inputs)
+            if in_q:
+                grad = self._in_coordinates(xp, rows, scales, grad)
+            results = [array.astype(given.dtype, copy=False) for array in (value, grad)]
+            value, grad = results if package is xp else map(package.from_dlpack, results)
+        return value, grad
+
+    def _on_cores(self, name: str, *inputs: Any) -> tuple[Any, Any]:
+        call = self.gradient.objective_batch if name == "objective" else self.gradient.value_and_gradient_batch
+        return call(*inputs, threads=len(os.sched_getaffinity(0)))
+
+    def _launch(self, cupy: Any, name: str, q: Any, n: Any = None) -> tuple[Any, Any]:
+        """Run the CUDA kernel of the function ``name``; inputs and results are arrays of CuPy."""
+        if (kernel := self._kernels.get(name)) is None:
+            header = self._folder / f"{self.gradient.manifest['prefix']}.cuh"
+            if not header.is_file():
+                raise InputError("has no CUDA code", where=str(self._folder), hint="export it with `cuda`")
+            expression = f"{self.gradient.symbols[name]}_kernel<{_THREADS}>"
+            code, options = header.read_text(encoding="utf-8"), ("-std=c++17",)
+            module = cupy.RawModule(code=code, options=options, backend="nvrtc", name_expressions=(expression,))
+            kernel = self._kernels[name] = module.get_function(expression)
+        count, normals = len(q), list[Any]()
+        if n is not None:
+            if n.shape not in ((3,), (count, 3)):
+                raise InputError(f"has shape {n.shape}", where="n", hint=f"give shape (3,) or ({count}, 3)")
+            normals = [cupy.ascontiguousarray(n), np.int32(n.size // 3)]
+        value = cupy.empty(count, dtype=self.gradient.dtype)
+        grad = cupy.empty((count, self.gradient.nv), dtype=self.gradient.dtype)
+        if count:
+            # The last argument is a null pointer in place of the array of return codes.
+            kernel((-(-count // _THREADS),), (_THREADS,), (q, *normals, np.int32(count), value, grad, 0))
+        return value, grad
+
+    def _normalized(self, xp: Any, q: Any) -> tuple[Any, Any]:
+        """Return ``u(q)``, and the factor of each entry of ``q``, shape (N, nq)."""
+        scales = xp.ones_like(q)
+        for names, at, _ in self._joints:
+            unit = slice(at + len(names) - (4 if "qw" in names else 2), at + len(names))
+            scales[:, unit] = 1 / xp.linalg.norm(q[:, unit], axis=1)[:, None]
+        return q * scales, scales
+
+    def _in_coordinates(self, xp: Any, q: Any, scales: Any, tangent: Any) -> Any:
+        """Return the gradients of ``H(u(q))``, shape (N, nq), from tangent gradients and ``u(q)``."""
+        grad = xp.empty_like(q)
+        plain = np.ones(self.gradient.nq, dtype=bool), np.ones(self.gradient.nv, dtype=bool)
+        for names, at, speed in self._joints:
+            last, size = at + len(names), _JOINTS[names]
+            plain[0][at:last], plain[1][speed : speed + size] = False, False
+            g = tangent[:, speed : speed + size]
+            if "qw" in names:
+                # With the vector part r and the scalar part w, q̇ = ½(wω + r×ω, −rᵀω) and R v = v + 2 r×(wv + r×v).
+                r, w, turn = q[:, last - 4 : last - 1], q[:, last - 1 : last], g[:, -3:]
+                grad[:, last - 4 : last - 1] = 2 * (w * turn + xp.cross(r, turn))
+                grad[:, last - 1] = -2 * (r * turn).sum(axis=1)
+                if size == 6:
+                    grad[:, at : at + 3] = g[:, :3] + 2 * xp.cross(r, w * g[:, :3] + xp.cross(r, g[:, :3]))
+                continue
+            c, s = q[:, last - 2], q[:, last - 1]
+            grad[:, last - 2], grad[:, last - 1] = -s * g[:, -1], c * g[:, -1]
+            if size == 3:
+                grad[:, at], grad[:, at + 1] = c * g[:, 0] - s * g[:, 1], s * g[:, 0] + c * g[:, 1]
+        grad[:, plain[0]] = tangent[:, plain[1]]
+        return grad * scales
+
+
+def _joints(q_names: Sequence[str]) -> Iterator[tuple[tuple[str, ...], int, int]]:
+    """Yield names of entries, first entry in q and first entry in ν of each joint whose numbers in q and ν differ."""
+    at = speed = 0
+    while at < len(q_names):
+        for names, size in _JOINTS.items():
+            entries = q_names[at : at + len(names)]
+            if len(entries) == len(names) and all(e.endswith(f" {n}") for e, n in zip(entries, names, strict=True)):
+                yield names, at, speed
+                at, speed = at + len(names), speed + size
+                break
+        else:
+            at, speed = at + 1, speed + 1
+
+
+def _package(array: Any) -> Any:
+    """Return the module of an array, which has the function ``from_dlpack``; NumPy for lists and numbers."""
+    if hasattr(array, "__array_namespace__"):
+        return array.__array_namespace__()
+    return sys.modules[type(array).__module__.partition(".")[0]] if hasattr(array, "__dlpack__") else np
+
+
+def _on_gpu(array: Any) -> bool:
+    return hasattr(array, "__dlpack_device__") and array.__dlpack_device__()[0] == _CUDA
+
+
+def _to(xp: Any, array: Any) -> Any:
+    """Return an array as an array of NumPy or CuPy, without a copy if possible."""
+    if _on_gpu(array):
+        return xp.from_dlpack(array)
+    return xp.asarray(np.from_dlpack(array) if hasattr(array, "__dlpack__") and _package(array) is not np else array)

@@ -1,0 +1,230 @@
+"""Batches of H and the objective: on all cores, by the CUDA kernels as C++, in PyTorch and in JAX."""
+
+from __future__ import annotations
+
+import ctypes
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import impact_posture as ip
+from impact_posture.codegen.export import Export, write_export
+from impact_posture.codegen.self_test import sample_postures
+from impact_posture.errors import InputError
+from impact_posture.impact.impact_contact import ImpactContact
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from tests.codegen.test_cuda import on_host
+from tests.support.tools import need_compiler
+from tests.support.urdfs import joint, link, load
+
+N = np.array([0.0, 0.6, 0.8])
+
+
+@dataclass(frozen=True)
+class Sample:
+    objective: WorstCaseObjective
+    written: Export
+    q: Any
+
+    @property
+    def out(self) -> Path:
+        return self.written.out
+
+
+@pytest.fixture(scope="module")
+def sample(tmp_path_factory: pytest.TempPathFactory) -> Sample:
+    """A floating robot with a planar, a continuous and a revolute joint, and postures with batches for threads."""
+    need_compiler()
+    folder = tmp_path_factory.mktemp("frameworks")
+    robot = load(
+        folder, link("base", 3.0, "0.1 0 0"), link("a", 1.0, "0 0.1 0.2"), link("b", 0.7, "0 0 0.2"),
+        link("tip", 0.4, "0.1 0 0.1"), joint("slide", "base a", "0 0 1", kind="planar", more=""),
+        joint("spin", "a b", at="0 0 0.3", kind="continuous"), joint("bend", "b tip", "1 0 0", at="0 0 0.4"),
+        root="free-flyer",
+    )  # fmt: skip
+    objective = WorstCaseObjective(robot, ImpactContact("tip", N, (0, 0, 0.1)), kind="effective-mass")
+    written = write_export([objective], folder / "out", prefix="small", cuda=True, build=True)
+    return Sample(objective, written, np.array(sample_postures(robot, 600, 5)))
+
+
+def slopes(function: Any, q: Any) -> Any:
+    """Return central differences of a function of one posture in the entries of ``q``."""
+    step = 1e-6
+    return np.array([(function(q + d) - function(q - d)) / (2 * step) for d in step * np.eye(len(q))])
+
+
+def of_oracle(sample: Sample, q: Any) -> float:
+    """Return H with Pinocchio, at ``q`` with normalized quaternion and angles."""
+    return float(sample.objective.oracle.quantities(pin.normalize(sample.objective.robot.model, q)).H)
+
+
+def test_batches_equal_single_calls_on_all_threads(sample: Sample, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: range(3))
+    metric = ip.gpu.load(sample.out, robot=sample.objective.robot)
+    H, grad = metric.value_and_gradient(sample.q, N)
+    mass, slope = metric.objective(sample.q)
+    single = metric.gradient
+    for k in (0, 299, 300, 599):
+        value, row = single.value_and_gradient(sample.q[k], N)
+        np.testing.assert_allclose([H[k], *grad[k]], [value, *row], rtol=0, atol=1e-12 * np.abs(row).max())
+        value, row = single.objective(sample.q[k])
+        assert mass[k] == value and slope[k].tolist() == row.tolist()
+    assert mass[0] == pytest.approx(sample.objective.value(sample.q[0]), rel=1e-10)
+    broken = sample.q[:3].copy()
+    broken[1, 3:7] *= 2
+    assert np.isnan(metric.objective(broken)[0]).tolist() == [False, True, False]
+    with pytest.raises(InputError, match="q: has shape"):
+        metric.objective(sample.q[0])
+    half, _ = metric.value_and_gradient(sample.q[:2].astype(np.float32) * 1.0, N)
+    assert half.dtype == np.float32
+
+
+def test_gradients_in_q_equal_differences_without_a_norm(sample: Sample) -> None:
+    metric = ip.gpu.load(sample.out)
+    q = sample.q[:3] * np.array([1.0, 1, 1, 1.1, 1.1, 1.1, 1.1, 1, 1, 0.9, 0.9, 1.2, 1.2, 1])
+    H, grad = metric.value_and_gradient(q, N, in_q=True)
+    for k in range(3):
+        assert H[k] == pytest.approx(of_oracle(sample, q[k]), rel=1e-10)
+        expected = slopes(lambda at: of_oracle(sample, at), q[k])
+        np.testing.assert_allclose(grad[k], expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+    _, tangent = metric.value_and_gradient(sample.q[:3], N)
+    np.testing.assert_allclose(tangent[0], sample.objective.oracle.gradient_H(sample.q[0]), rtol=1e-6, atol=1e-9)
+
+
+class OnGpu(np.ndarray):
+    """An array of NumPy that names a GPU as its device."""
+
+    def __dlpack_device__(self) -> Any:
+        return 2, 0
+
+
+def as_gpu(array: Any) -> Any:
+    return np.array(array).view(OnGpu)
+
+
+class Cupy:
+    """The functions of CuPy that the package calls.  Its kernels are the CUDA code, compiled as C++."""
+
+    cuda = SimpleNamespace(Device=lambda number: __import__("contextlib").nullcontext())
+    library: ctypes.CDLL
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(np, name)
+
+    @staticmethod
+    def from_dlpack(array: Any) -> Any:
+        return array.view(np.ndarray)
+
+    def RawModule(self, code: str, options: Any, backend: str, name_expressions: tuple[str, ...]) -> Any:
+        assert "_eval_kernel" in code and backend == "nvrtc"
+        return self
+
+    def get_function(self, expression: str) -> Any:
+        name, threads = expression.removesuffix(">").split("_kernel<")
+        function = getattr(self.library, f"{name}_rows" if name.endswith("eval") else f"{name}_batch")
+
+        def kernel(grid: Any, block: Any, arguments: Any) -> None:
+            q, *normals, count, value, grad, status = arguments
+            assert grid[0] * block[0] >= count and block[0] == int(threads) and status == 0
+            pointers = [ctypes.c_void_p(array.ctypes.data) for array in (q, *normals[:1], value, grad)]
+            pointers.insert(-2, ctypes.c_int(count))
+            if normals:
+                assert normals[1] == 1
+                pointers.append(ctypes.c_void_p(0))
+            function(*pointers)
+
+        return kernel
+
+
+def test_arrays_on_a_gpu_call_the_kernels(sample: Sample, monkeypatch: pytest.MonkeyPatch) -> None:
+    """There is no GPU here: the kernels run as C++, and CuPy is replaced by NumPy."""
+    fake = Cupy()
+    fake.library = on_host(sample.written, [sample.objective])
+    monkeypatch.setitem(sys.modules, "cupy", fake)
+    monkeypatch.setattr(OnGpu, "__array_namespace__", lambda self: fake, raising=False)
+    metric = ip.gpu.load(sample.out)
+    for in_q in (False, True):
+        on_gpu, on_cpu = (
+            [*metric.value_and_gradient(q, N, in_q=in_q), *metric.objective(q, in_q=in_q)]
+            for q in (as_gpu(sample.q), sample.q)
+        )
+        for ours, theirs in zip(on_gpu, on_cpu, strict=True):
+            np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-11 * np.abs(theirs).max())
+    (sample.out / "small.cuh").rename(sample.out / "hidden")
+    with pytest.raises(InputError, match="export it with"):
+        ip.gpu.load(sample.out).objective(as_gpu(sample.q))
+    (sample.out / "hidden").rename(sample.out / "small.cuh")
+
+
+def test_absent_packages_are_named(sample: Sample, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, call in {
+        "cupy": lambda: ip.gpu.load(sample.out).objective(as_gpu(sample.q)),
+        "jax": lambda: ip.jax.load(sample.out),
+    }.items():
+        monkeypatch.setitem(sys.modules, name, None)
+        with pytest.raises(InputError, match="pip install"):
+            call()
+
+
+# ---- PyTorch ------------------------------------------------------------------------------------------------------
+
+
+def test_torch_differentiates(sample: Sample) -> None:
+    torch = pytest.importorskip("torch", reason="needs PyTorch: pip install torch", exc_type=ImportError)
+    metric = ip.torch.load(sample.out)
+    q = torch.tensor(sample.q[:4], requires_grad=True)
+    assert torch.autograd.gradcheck(lambda at: metric(at, N), [q])
+    assert torch.autograd.gradcheck(metric.objective, [q])
+    grid = q.detach().reshape(2, 2, -1).requires_grad_()
+    normals = torch.tensor(np.tile(N, (2, 2, 1)))
+    H = metric(grid, normals)
+    assert H.shape == (2, 2) and H.dtype == torch.float64
+    H.sum().backward()
+    expected = metric.batch.value_and_gradient(sample.q[:4], N, in_q=True)
+    np.testing.assert_array_equal(H.detach().reshape(4), expected[0])
+    np.testing.assert_array_equal(grid.grad.reshape(4, -1), expected[1])
+    single = metric.objective(q.detach().float())
+    assert single.dtype == torch.float32 and not single.requires_grad
+    tangent = metric.batch.objective(q.detach())
+    assert isinstance(tangent[1], torch.Tensor) and tangent[1].shape == (4, sample.objective.robot.nv)
+    with pytest.raises(InputError, match="detach n"):
+        metric(q, torch.tensor(N, requires_grad=True))
+    optimizer = torch.optim.Adam([q], 0.05)
+    first = metric(q, N).detach()
+    for _ in range(20):
+        optimizer.zero_grad()
+        metric(q, N).sum().backward()
+        optimizer.step()
+    assert (metric(q, N) < first).all()
+
+
+# ---- JAX ----------------------------------------------------------------------------------------------------------
+
+
+def test_jax_transforms(sample: Sample) -> None:
+    jax = pytest.importorskip("jax", reason="needs JAX: pip install jax", exc_type=ImportError)
+    metric = ip.jax.load(sample.out)
+    with jax.enable_x64(True):
+        q, n = jax.numpy.asarray(sample.q[:4]), jax.numpy.asarray(N)
+        H, grad = metric.batch.value_and_gradient(sample.q[:4], N, in_q=True)
+        np.testing.assert_array_equal(metric(q, n), H)
+        np.testing.assert_array_equal(jax.jit(jax.vmap(metric, (0, None)))(q, n), H)
+        np.testing.assert_array_equal(jax.vmap(jax.jit(jax.grad(metric)), (0, None))(q, n), grad)
+        change = jax.numpy.ones_like(q)
+        _, along = jax.jvp(lambda at: metric(at, n), (q,), (change,))
+        np.testing.assert_allclose(along, grad.sum(axis=1), rtol=1e-12)
+        mass, slope = metric.batch.objective(sample.q[:4], in_q=True)
+        value, back = jax.jit(jax.vmap(jax.value_and_grad(metric.objective)))(q)
+        np.testing.assert_array_equal(value, mass)
+        np.testing.assert_array_equal(back, slope)
+        ours, _ = metric.batch.objective(q)
+        assert isinstance(ours, jax.Array)
+        with pytest.raises(InputError, match="derivative with respect to n"):
+            jax.grad(metric, argnums=1)(q[0], n)
+    assert metric(np.float32(sample.q[:2]), N).dtype == np.float32
