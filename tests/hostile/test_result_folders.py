@@ -7,13 +7,17 @@ from __future__ import annotations
 
 import json
 import random
+import re
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from impact_posture.output import plot
+from impact_posture.system.scratch_folder import RECORD
 from tests.hostile.arena import attack, strike
+from tests.hostile.values import spoiled
 
 STOP = ("--out", "precious", "--force")
 COUNT = 8
@@ -82,20 +86,47 @@ def test_results_of_another_version(key: str, value: object, words: str, result:
         assert words in outcome.err and len(outcome.err) < 500
 
 
+def spoil_problem(folder: Path, rng: random.Random) -> None:
+    path = folder / "problem.toml"
+    path.write_bytes(spoiled(path.read_text(), rng))
+
+
+def spoil_record(folder: Path, rng: random.Random) -> None:
+    path = folder / RECORD
+    path.write_bytes(rng.choice((b"", b"[]", b"{}", b'{"schema": 1}', b"\xff", path.read_bytes()[:-9])))
+    if rng.random() < 0.5:
+        (folder / "thesis.txt").write_text("ten years")
+
+
 FAULTS = (spoil_document, spoil_arrays, spoil_bytes, spoil_entries)
+# Command, its options, and the faults of the folder out/ that the command reads or replaces.
+READERS = {
+    "plot": (("plot", "out", "--figure", "jump", "--format", "svg"), FAULTS),
+    "codegen": (("codegen", "out", *STOP), FAULTS),
+    "report": (("report", "out"), FAULTS),
+    "verify": (("verify", "out", "--samples", "1"), (spoil_problem, spoil_problem, spoil_bytes, spoil_entries)),
+    "optimize": (
+        ("optimize", "out/problem.toml", "--starts", "1", "--no-codegen", "--out", "out", "--force", "--quiet"),
+        (spoil_problem, spoil_problem, spoil_record, *FAULTS),
+    ),
+}
 
 
-@pytest.mark.parametrize("command", ["plot", "codegen", "report"])
-def test_spoiled_results(command: str, result: Path, arena: Path, hostile_full: bool) -> None:
+@pytest.mark.parametrize("command", READERS)
+def test_spoiled_results(
+    command: str, result: Path, arena: Path, hostile_full: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     rng = random.Random(command)
-    more = {"plot": ("--figure", "jump", "--format", "svg"), "codegen": STOP, "report": ()}[command]
+    argv, faults = READERS[command]
+    if command == "optimize":
+        monkeypatch.setattr(plot, "draw_all", lambda *_, **__: [])
 
     def arrange(k: int) -> None:
         shutil.rmtree(arena / "out", ignore_errors=True)
         shutil.copytree(result, arena / "out")
         if k:
-            rng.choice(FAULTS)(arena / "out", rng)
+            rng.choice(faults)(arena / "out", rng)
 
-    outcomes = attack([(command, "out", *more)] * (COUNT * (20 if hostile_full else 1)), arena, arrange)
+    outcomes = attack([argv] * (COUNT * (20 if hostile_full else 1)), arena, arrange)
     assert outcomes[0].code == 0 or "holds thesis.txt" in outcomes[0].err, outcomes[0].err
-    assert any(outcome.code == 1 and "out: " in outcome.err for outcome in outcomes[1:])
+    assert any(outcome.code == 1 and re.search(r"out[:/]", outcome.err) for outcome in outcomes[1:])
