@@ -61,7 +61,7 @@ class Recorder:
 
     def take(self, command: Command, level: float, distance: float) -> None:
         """Record a tick and the state of the world after it."""
-        self._rows.append((command.rotor_speed, level, _NUMBERS[command.status], distance))
+        self._rows.append((command.rotor_speed, float(level), _NUMBERS[command.status], distance))
         self._world.mark()
         if len(self._rows) == _BLOCK:
             self._trace()

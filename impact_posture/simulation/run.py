@@ -79,15 +79,15 @@ def run(factory: ControllerFactory, controller: str, *, seed: int = 0, mode: Mod
         InputError: A tick is not a multiple of the physics step, a tick or the run is too long, or ``only`` is not 1
             or -1.
     """
-    driver = factory.driver(controller, mode, gain)
     scenario = factory.setup.scenario
-    if scenario.contacts:
-        return (_contacts(_Loop(factory, driver, seed), scenario.contacts, mode),)
-    if only not in (None, 1, -1):
+    if only not in (None, 1, -1) and not scenario.contacts:
         raise InputError(f"{only} is not a sign of a push", where=scenario.source, hint="give 1 or -1")
-    task = scenario.task
-    assert not isinstance(task, RepeatedContacts)  # noqa: S101 (the branch for contacts has returned)
-    return _pushes(_Loop(factory, driver, seed), task, task.signs if only is None else (only,), mode)
+    driver = factory.driver(controller, mode, gain)
+    with factory.errors_named(controller):
+        loop, task = _Loop(factory, driver, seed), scenario.task
+        if isinstance(task, RepeatedContacts):
+            return (_contacts(loop, task, mode),)
+        return _pushes(loop, task, task.signs if only is None else (only,), mode)
 
 
 class _Loop:

@@ -181,7 +181,7 @@ def test_the_installed_command_runs_a_registered_controller(setback: ModuleType,
         refused(start(*words, name, cwd=tmp_path), 1, *said)
 
 
-@pytest.mark.parametrize(("name", "words"), [("odd", "cannot be built: TypeError"), ("number", "of type int")])
+@pytest.mark.parametrize(("name", "words"), [("odd", "fails: TypeError"), ("number", "of type int")])
 def test_what_another_package_makes_must_be_a_driver(setback: ModuleType, name: str, words: str) -> None:
     needs_mujoco()
     setback.len = lambda *given: len(given)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from importlib import metadata
@@ -271,17 +272,35 @@ class ControllerFactory:
         if name not in added.names:
             known = (*CONTROLLERS, *sorted(added.names))
             raise ControllerNotFound(name, known, hint=f"one of: {', '.join(known)}")
-        where = f"controller '{name}' ({added[name].value})"
-        try:
+        with self.errors_named(name):
             driver = added[name].load()(self, mode, gain)
-        except ImpactPostureError:
-            raise
-        except Exception as error:
-            # The code of another package can raise any exception.
-            what = f"cannot be built: {type(error).__name__}: {error}"
-            raise InputError(what, where=where, hint="correct or uninstall the package that adds it") from error
         if not isinstance(driver, Driver):
-            raise InputError(
-                f"returns an object of type {type(driver).__name__}", where=where, hint="return a Driver"
-            )
+            where, what = _from_outside(name), f"returns an object of type {type(driver).__name__}"
+            raise InputError(what, where=where, hint="return a Driver")
         return driver
+
+    @contextmanager
+    def errors_named(self, name: str) -> Iterator[None]:
+        """Convert exceptions into errors that name controller ``name``, if it belongs to another package.
+
+        Raises:
+            InputError: The code of the other package raised an exception, or returned what cannot be used.
+        """
+        try:
+            yield
+        except (Exception, SystemExit, GeneratorExit) as error:
+            if name.removesuffix(_STIFF) in CONTROLLERS or isinstance(error, MemoryError):
+                raise
+            if isinstance(error, ImpactPostureError):
+                # The simulated world refuses the command of the controller.
+                if error.where != "command":
+                    raise
+                raise InputError(error.what, where=f"{_from_outside(name)}, command", hint=error.hint) from error
+            what = f"fails: {type(error).__name__}: {error}"
+            hint = "correct or uninstall the package that adds it"
+            raise InputError(what, where=_from_outside(name), hint=hint) from error
+
+
+def _from_outside(name: str) -> str:
+    """Name a controller of another package and its entry point."""
+    return f"controller '{name}' ({metadata.entry_points(group=GROUP)[name].value})"
