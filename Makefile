@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 JOBS ?= 2
 
-.PHONY: help demo test coverage wheel test-wheel lowest lint types docs bench bench-gpu study-impacts study-elastic study-global study-feasible study-flow study-robustness study-real-impacts study-verdict study-robots study-scan study-controller study-sweep study-hostile reproduction calibration regression
+.PHONY: help demo test coverage wheel test-wheel lowest lint types docs bench bench-gpu study-impacts study-elastic study-hits study-global study-feasible study-flow study-robustness study-real-impacts study-verdict study-robots study-scan study-controller study-sweep study-hostile reproduction calibration regression
 .PHONY: pictures viewer clean
 
 help:
@@ -20,6 +20,7 @@ help:
 	@echo "make coverage    measure the branch coverage of both packages by the tests, for the documentation"
 	@echo "make study-impacts  compare predictions of the objectives with impacts simulated in MuJoCo"
 	@echo "make study-elastic  compare the predicted inertia of arms with elastic joints with MuJoCo"
+	@echo "make study-hits     predict recorded hits of an arm; DATA= is the folder of the recordings (three minutes)"
 	@echo "make study-global   measure how complete the global search is, and how often the default search reaches the best known posture (an hour; the first time some hours)"
 	@echo "make reproduction   run the experiments of the paper with many seeds, for the documentation (about ten minutes)"
 	@echo "make study-feasible  measure the effect of collision constraints, limits at rest and approach speed"
@@ -108,6 +109,9 @@ study-impacts: $(VENV)/.installed-test
 
 study-elastic: $(VENV)/.installed-test
 	$(BIN)/python -m docs.studies elastic --write
+
+study-hits: $(VENV)/.installed-test
+	$(BIN)/python -m docs.studies hits --data "$(DATA)" --write
 
 study-global: $(VENV)/.installed-test
 	$(BIN)/python -m docs.studies global --write

@@ -32,6 +32,7 @@ def main() -> int:
     parser.add_argument("--number", type=int, help="points: repeat and print only this point")
     parser.add_argument("--jobs", type=int, default=2, help="number of processes for points and reproduction")
     parser.add_argument("--against", default="", metavar="PROGRAM", help="answer: another impact-posture to compare")
+    parser.add_argument("--data", default="", metavar="FOLDER", help="hits: folder of the recordings")
     parser.add_argument("--write", action="store_true", help="also write the page in docs/generated")
     asked = parser.parse_args()
     wanted = [STUDIES[name] for name in asked.names]
@@ -44,8 +45,9 @@ def main() -> int:
 
 def _run(study: Study, asked: argparse.Namespace) -> int:
     request = Request(
-        asked.only, asked.count or study.count, asked.seed, asked.number, asked.jobs, asked.write, asked.against
-    )
+        asked.only, asked.count or study.count, asked.seed, asked.number, asked.jobs, asked.write, asked.against,
+        asked.data,
+    )  # fmt: skip
     lines = [study.head, ""]
     try:
         for line in study.lines(request):

@@ -79,6 +79,7 @@ STUDIES = {
         Study("restitution", "restitution", "rebound of each contact law", target="calibration"),
         Study("impacts", "impact.page", "objectives against impacts in MuJoCo; postures", 30, target="study-impacts"),
         Study("elastic", "elastic.study", "arms with elastic joints in MuJoCo; postures", 20, target="study-elastic"),
+        Study("hits", "hits.study", "recorded hits of an iiwa 7, predicted; resamples", 200, target="study-hits"),
         Study("global", "global_search:maps", "self-motions and their bounds; seeds", 10, target="study-global"),
         Study("search", "search_quality:arms", "the default search and 16 starts; seeds", 3, target="study-global"),
         Study("search-catalogue", "search_quality:catalogue", "the same for the catalogue; seeds", 3, page=False),
@@ -112,6 +113,7 @@ class Request:
     jobs: int = 1
     write: bool = False
     against: str = ""
+    data: str = ""
     missed: list[str] = field(default_factory=list)
 
 
