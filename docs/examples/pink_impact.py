@@ -3,10 +3,11 @@
     pip install pin-pink
     python pink_impact.py
 
-``ImpactTask`` asks for the velocity ``v = −K ∇H(q)`` and is part of the cost of the QP in pink.  The tasks that the
-robot must keep are equality constraints in pink, so that H decreases only in their null space.  The gradient comes
-from the compiled C export.  For each contact below, pink runs from the default posture until the robot rests.  Then
-the posture is compared with the optima that ``impact-posture optimize`` computes offline under the same constraints.
+``ImpactTask`` asks for the velocity ``v = −K ∇f(q)`` and is part of the cost of the QP in pink.  ``f`` is the
+objective of the compiled C export, here H.  The tasks that the robot must keep are equality constraints in pink, so
+that H decreases only in their null space.  For each contact below, pink runs from the default posture until the robot
+rests.  Then the posture is compared with the optima that ``impact-posture optimize`` computes offline under the same
+constraints.
 """
 
 from __future__ import annotations
@@ -32,25 +33,24 @@ DT, DURATION, AT_REST = 0.01, 60.0, 1e-6  # time step, s; longest run, s; norm o
 
 
 class ImpactTask(Task):
-    """Task ``Δq = −K ∇H(q) Δt``, with the error ``K ∇H Δt`` and the identity as Jacobian, both on the tangent space.
+    """Task ``Δq = −K ∇f(q) Δt``, with the error ``K ∇f Δt`` and the identity as Jacobian, both on the tangent space.
 
-    The size of H depends on the robot.  So the norm of v at the first tick is given instead of K.
+    ``f`` is the objective of an export, such as H or the effective mass.  Its size depends on the robot.  So the norm
+    of v at the first tick is given instead of K.
     """
 
-    def __init__(self, gradient: ImpactGradient, normal: tuple[float, ...], speed: float, q: np.ndarray) -> None:
+    def __init__(self, gradient: ImpactGradient, speed: float, q: np.ndarray) -> None:
         super().__init__(cost=1.0)
-        self.gradient, self.normal = gradient, normal
-        self.K = speed / np.linalg.norm(gradient.value_and_gradient(q, normal)[1])
+        self.gradient, self.K = gradient, speed / np.linalg.norm(gradient.objective(q)[1])
 
     def compute_error(self, configuration: pink.Configuration) -> np.ndarray:
-        _, grad = self.gradient.value_and_gradient(configuration.q, self.normal)
-        return self.K * DT * grad
+        return self.K * DT * self.gradient.objective(configuration.q)[1]
 
     def compute_jacobian(self, configuration: pink.Configuration) -> np.ndarray:
         return configuration.tangent.eye
 
     def __repr__(self) -> str:
-        return f"ImpactTask(normal={self.normal}, K={self.K:.3g})"
+        return f"ImpactTask(K={self.K:.3g})"
 
 
 class PointTask(Task):
@@ -149,7 +149,7 @@ def follow(contact: Contact, speed: float = 5.0) -> Outcome:
     settings = {"collision": False, "holdable": False, **contact.settings}
     prepared = prepare(validate(ProblemSettings, settings, "options"))
     impact, offline = prepared.impact, solve(prepared.problem)
-    frame, normal = impact.contact.frame, impact.contact.normal
+    frame = impact.contact.frame
     with tempfile.TemporaryDirectory() as folder:
         export(impact.objective, Path(folder), prefix="impact", check=False)
         gradient = ImpactGradient.load(folder, robot=impact.robot)
@@ -157,12 +157,12 @@ def follow(contact: Contact, speed: float = 5.0) -> Outcome:
     model = limited(prepared)
     configuration = pink.Configuration(model, model.createData(), offline.initial)
     held = contact.held(frame, configuration)
-    task = ImpactTask(gradient, normal, speed, configuration.q)
-    H, errors = [gradient.value(configuration.q, normal)], []
+    task = ImpactTask(gradient, speed, configuration.q)
+    H, errors = [gradient.objective(configuration.q)[0]], []
     for _ in range(round(DURATION / DT)):
         v = pink.solve_ik(configuration, [task], DT, solver="daqp", constraints=held)
         configuration.integrate_inplace(v, DT)
-        H.append(gradient.value(configuration.q, normal))
+        H.append(gradient.objective(configuration.q)[0])
         errors.append(np.linalg.norm(np.concatenate([t.compute_error(configuration) for t in held])))
         if np.linalg.norm(v) < AT_REST:
             break

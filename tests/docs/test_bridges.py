@@ -1,4 +1,4 @@
-"""Examples of docs/bridges.md: the impact term in pink and in C++, compared with independent numbers."""
+"""Examples of docs/bridges.md and docs/frameworks.md, compared with independent numbers."""
 
 from __future__ import annotations
 
@@ -17,13 +17,24 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+import impact_posture as ip
 from impact_posture.codegen.c_literals import DOUBLE, FLOAT, Real
 from impact_posture.codegen.export import export
+from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.errors import CompilerError
 from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.robot.robot_loader import load_robot
 from impact_posture.system.toolchain import run_compiler
-from tests.support.helpers import Vector, assert_close, central_gradient, frame_placement, robot, unit
+from tests.support.helpers import (
+    Vector,
+    assert_close,
+    central_gradient,
+    frame_placement,
+    random_configurations,
+    robot,
+    unit,
+)
 from tests.support.tools import cxx_compiler, eigen_headers, need_compiler
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -51,16 +62,21 @@ def test_examples_need_no_file_of_the_checkout(file: Path) -> None:
 # ---- pink ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def example() -> ModuleType:
-    pytest.importorskip("pink", reason="needs pink: pip install pin-pink")
-    spec = importlib.util.spec_from_file_location("pink_impact", EXAMPLES / "pink_impact.py")
+def load_example(name: str, package: str, installed: str) -> ModuleType:
+    """Return the module of an example; skip the test if its package is not installed."""
+    pytest.importorskip(package, reason=f"needs {package}: pip install {installed}", exc_type=ImportError)
+    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     # The decorator of dataclasses requires that their module is in ``sys.modules``.
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture(scope="module")
+def example() -> ModuleType:
+    return load_example("pink_impact", "pink", "pin-pink")
 
 
 @dataclass(frozen=True)
@@ -151,6 +167,72 @@ def test_held_tasks_have_the_jacobian_of_their_error(example: ModuleType) -> Non
             return np.array(task.compute_error(pink.Configuration(model, model.createData(), at)))
 
         assert_close(task.compute_jacobian(configuration), central_gradient(error, model, q, 1e-3), 1e-9, repr(task))
+
+
+def test_pink_lowers_the_effective_mass(example: ModuleType, tmp_path: Path) -> None:
+    need_compiler()
+    pink = importlib.import_module("pink")
+    arm = robot("ur5")
+    contact = ImpactContact("tool0", (0, 0, 1), friction=0.0)
+    export(WorstCaseObjective(arm, contact, kind="effective-mass"), tmp_path, prefix="arm", check=False)
+    gradient = ImpactGradient.load(tmp_path, robot=arm)
+    configuration = pink.Configuration(arm.model, arm.model.createData(), arm.posture())
+    task, held = example.ImpactTask(gradient, 5.0, configuration.q), example.point("tool0", configuration)
+    masses = [gradient.objective(configuration.q)[0]]
+    for _ in range(20):
+        v = pink.solve_ik(configuration, [task], example.DT, solver="daqp", constraints=held)
+        configuration.integrate_inplace(v, example.DT)
+        masses.append(1 / WorstCaseObjective(arm, contact).oracle.quantities(configuration.q).G)
+    assert np.diff(masses).max() < 0 and masses[-1] < 0.99 * masses[0]
+
+
+# ---- mink, MuJoCo, PyTorch ----------------------------------------------------------------------------------------
+
+
+def test_mink_lowers_the_effective_mass_to_the_offline_optimum() -> None:
+    need_compiler()
+    example = load_example("mink_impact", "mink", "mink")
+    outcome = example.main()
+    arm = load_robot(str(example.MJCF))
+    objective = ip.ImpactObjective(arm, ImpactContact("tool", (0, 0, 1), friction=0.0), kind="effective-mass")
+    assert outcome.mass[-1] == pytest.approx(1 / objective.oracle.quantities(outcome.q).G, rel=1e-9)
+    assert np.diff(outcome.mass).max() <= 0 and outcome.error < 2e-4
+    task = {"collision": False, "holdable": False, "contact_pose": "position"}
+    best = ip.optimize(ip.PostureProblem(objective, **task), starts=6, jobs=1, search="multistart")
+    assert outcome.mass[-1] == pytest.approx(objective.value(best.q), rel=2e-3)
+    assert f"{outcome.mass[0]:.4g} kg to {outcome.mass[-1]:.4g} kg" in (DOCS / "bridges.md").read_text()
+
+
+def test_a_null_space_torque_lowers_H_in_mujoco(monkeypatch: pytest.MonkeyPatch) -> None:
+    need_compiler()
+    example = load_example("mujoco_null_space", "mujoco", "mujoco")
+    monkeypatch.setattr(example, "DURATION", 1.0)
+    with_term, without = example.main()
+    arm = load_robot(str(example.MJCF))
+    assert with_term.error < 2e-4 and without.error < 1e-4
+    assert with_term.H[-1] < 0.8 * with_term.H[0] and np.diff(with_term.H).max() < 1e-6
+    assert without.H[-1] == pytest.approx(without.H[0], rel=1e-3)
+    oracle = WorstCaseObjective(arm, ImpactContact("tool", (0, 0, 1))).oracle
+    assert with_term.H[-1] == pytest.approx(oracle.quantities(with_term.q).H, rel=1e-2)
+    rng = np.random.default_rng(1)
+    J, root = rng.normal(size=(3, 7)), rng.normal(size=(7, 7))
+    M = root @ root.T + np.eye(7)
+    torque = example.null_space_torque(M, J, rng.normal(size=7))
+    np.testing.assert_allclose(J @ np.linalg.solve(M, torque), 0, atol=1e-12)
+
+
+def test_a_penalty_in_pytorch_lowers_the_effective_mass() -> None:
+    need_compiler()
+    example = load_example("torch_reward", "torch", "torch")
+    torch = importlib.import_module("torch")
+    arm = load_robot(str(example.MJCF))
+    postures = random_configurations(arm.model, 3, "reward")
+    ours = example.tool_position(torch.tensor(np.array(postures)))
+    theirs = [frame_placement(arm.model, q, arm.frame_id("tool")).translation for q in postures]
+    np.testing.assert_allclose(ours, theirs, atol=1e-12)
+    without, with_penalty = example.main()
+    assert with_penalty.mass < 0.85 * without.mass
+    assert without.distance < 0.02 and with_penalty.distance < 0.02
 
 
 # ---- C++ ----------------------------------------------------------------------------------------------------------
