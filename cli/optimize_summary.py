@@ -163,6 +163,13 @@ def _path(page: Page, path: dict[str, Any]) -> None:
         )
     else:
         page.line("path: the start is the optimum" if path["found"] else "path: none leads away from the start")
+    if strike := path.get("strike"):
+        page.line(
+            f"  strikes at {number(strike['speed'])} m/s, with {strike['share']:.0%} of the velocity limits, after a "
+            f"run-up of {1e3 * strike['run_up_m']:.3g} mm from rest at {strike['run_up_s']:.3g} s"
+        )
+        if strike["hindrance"]:
+            page.line(f"  {number(strike['stated_speed'])} m/s is not possible, because of {strike['hindrance']}")
     # The verdict states why a path does not reach the optimum.
     if path["found"] and path["reason"]:
         page.line(f"  {path['reason']}")

@@ -63,6 +63,10 @@ def optimize(
     # For a large robot, fitting the collision shapes takes several seconds, unless they are in the cache.
     with page.progress("preparing"):
         prepared = prepare(settings)
+    if settings.strike:
+        from impact_posture.path.strike import check_strike
+
+        check_strike(prepared.problem, prepared.impact.speed)
     folder = Path(out) if out else default_out(prepared)
     check_output(folder, force=force, kind="result")
     announce(page, prepared)
@@ -83,7 +87,7 @@ def optimize(
             result = result.trade_off(settings.tradeoff, settings.tradeoff_against, compile=compile, progress=advance)
     if settings.path:
         with page.progress("planning", "paths", first="searching a path to the optimum"):
-            result = result.path(seed=settings.seed)
+            result = result.path(seed=settings.seed, strike=settings.strike)
     if not json:
         # Print the result first, because writing figures and C code takes longer.
         summarize(page, prepared, result.solution, result.document)
@@ -130,6 +134,7 @@ def _refuse_idle(typed: TypedSettings, settings: ProblemSettings) -> None:
     for name, used, hint in (
         ("box", settings.contact_pose == "box", "--contact-pose box"),
         ("tradeoff_against", bool(settings.tradeoff), "--tradeoff"),
+        ("strike", settings.path, "--path"),
         ("base_box", settings.base == "box", "--base box"),
         ("com_margin", settings.com is not False, "--com"),
         ("hold_force", settings.holdable, "--holdable"),

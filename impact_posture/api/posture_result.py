@@ -165,7 +165,7 @@ class PostureResult:
         return replace(self, tradeoff=curve)
 
     @checked
-    def path(self, *, seed: ZeroOrMore = 0) -> PostureResult:
+    def path(self, *, seed: ZeroOrMore = 0, strike: bool = False) -> PostureResult:
         """Return this result, completed by a timed path from the start to the optimum.
 
         The timing respects the robot's limits (:func:`~impact_posture.path.posture_path.posture_path`).  If no path
@@ -174,13 +174,16 @@ class PostureResult:
 
         Args:
             seed: Seed of the sampling planner.
+            strike: Whether the contact point arrives at the optimum with the approach speed of the problem, after a
+                run-up along the normal (:mod:`~impact_posture.path.strike`), instead of at rest.
 
         Raises:
-            InputError: The package TOPP-RA (``impact-posture[path]``) is not installed.
+            InputError: The package TOPP-RA (``impact-posture[path]``) is not installed, or the contact cannot strike.
         """
         from impact_posture.path.posture_path import posture_path
 
-        return replace(self, motion=posture_path(self.solution, seed=seed))
+        speed = self._prepared.impact.speed if strike else None
+        return replace(self, motion=posture_path(self.solution, seed=seed, strike=speed))
 
     @checked
     def save(

@@ -275,6 +275,7 @@ class ProblemSettings(ImpactSettings):
     path: bool = setting(
         False, "Find a timed path from the start to the optimum, on which all constraints hold.", TASK
     )
+    strike: bool = setting(False, "End --path at --speed, after a run-up along the normal, instead of at rest.", TASK)
     search: Search = setting(
         "adaptive", "adaptive; multistart; or global, which adds a map of one or two degrees of freedom.", SEARCH
     )

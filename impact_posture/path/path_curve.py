@@ -41,10 +41,13 @@ class PathCurve:
     because its velocity would jump where they become active.
 
     ``s`` contains the values of the parameter at the postures, evenly spaced, shape (n,).  ``z`` contains the tangent
-    coordinates of the postures at the first posture, shape (n, nv).
+    coordinates of the postures at the first posture, shape (n, nv).  ``ends`` contains the velocity ``dq/ds`` at the
+    first and the last posture, shape (nv,) each; ``None`` leaves it to the spline.
     """
 
-    def __init__(self, space: PathSpace, postures: Sequence[Array]) -> None:
+    def __init__(
+        self, space: PathSpace, postures: Sequence[Array], ends: tuple[Array | None, Array | None] = (None, None)
+    ) -> None:
         from scipy.interpolate import CubicSpline
 
         self._space, self._start = space, postures[0]
@@ -55,7 +58,11 @@ class PathCurve:
             if slot.kind.family == "continuous":
                 z[:, slot.v] = np.unwrap(z[:, slot.v], axis=0)
         self.z = z
-        self.spline = CubicSpline(self.s, z)
+        self._ends = tuple(
+            "not-a-knot" if v is None else (1, pin.dDifference(space.model, self._start, q, pin.ARG1) @ v)
+            for v, q in zip(ends, (postures[0], postures[-1]), strict=True)
+        )
+        self.spline = CubicSpline(self.s, z, bc_type=self._ends)
 
     @property
     def corners(self) -> Array:
@@ -97,7 +104,7 @@ class PathCurve:
             row += self._space.difference(self._start, projector.project(q).q) - self._space.difference(
                 self._start, q
             )
-        return CubicSpline(s, z)
+        return CubicSpline(s, z, bc_type=self._ends)
 
     def deviation(self) -> float:
         """Return the largest tangent distance of the curve from the constraints; infinite if a posture is not valid.

@@ -15,6 +15,7 @@ from impact_posture.errors import printable
 from impact_posture.path.path_timing import LimitUse
 from impact_posture.path.posture_path import PosturePath
 from impact_posture.path.row_interpolation import INTERPOLATION
+from impact_posture.path.strike import Strike
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 from impact_posture.system.npz_files import read_arrays
@@ -34,18 +35,25 @@ def write_path(folder: Path, robot: Robot, path: PosturePath) -> None:
     name.  The angle of a continuous joint has no jumps at full turns.  The YAML is a
     ``trajectory_msgs/JointTrajectory``.  Between two rows, a motion along the quintic polynomial through both rows
     respects the limits.
+
+    The last row of a path with a strike is the contact.  The column ``contact`` of the CSV is 1 there.  The NPZ
+    contains the time of the contact, ``contact``, and a comment in the YAML states it.
     """
     names, angles = positions(robot, path.q)
     columns = [printable(name) for name in robot.tangent_names]
     with (folder / "path.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         head = [f"{kind}:{name}" for kind, each in (("q", names), ("v", columns), ("a", columns)) for name in each]
+        table = np.column_stack([path.t, angles, path.v, path.a]).tolist()
+        if path.strike is not None:
+            head, table = [*head, "contact"], [[*row, int(row is table[-1])] for row in table]
         writer.writerow(["t", *head])
-        writer.writerows(np.column_stack([path.t, angles, path.v, path.a]).tolist())
+        writer.writerows(table)
     use = {} if path.use is None else {name: getattr(path.use, name) for name in _SHARES}
+    more: dict[str, Any] = {} if path.strike is None else {"contact": path.strike.contact_s}
     np.savez_compressed(
         folder / "path.npz", t=path.t, q=path.q, v=path.v, a=path.a, objective=path.objectives,
-        **{f"share_{name}": values for name, values in use.items()},
+        **{f"share_{name}": values for name, values in use.items()}, **more,
     )  # fmt: skip
     (folder / "path.yaml").write_text(_trajectory(robot, path, angles), encoding="utf-8")
 
@@ -71,7 +79,15 @@ def read_path(folder: Path, block: Mapping[str, Any], robot: Robot) -> PosturePa
         t=arrays["t"], q=arrays["q"], v=arrays["v"], a=arrays["a"],
         use=LimitUse(**shares, largest=block["limits"]) if shares else None,
         objectives=arrays["objective"],
+        strike=_strike(block["strike"], robot) if "strike" in block else None,
     )  # fmt: skip
+
+
+def _strike(block: Mapping[str, Any], robot: Robot) -> Strike:
+    velocity = np.array(block["velocity"], dtype=float)
+    if velocity.shape != (robot.nv,) or not np.isfinite(velocity).all():
+        raise ValueError(f"the velocity of the strike does not fit {robot.name}")
+    return Strike(**{**block, "velocity": velocity})
 
 
 def positions(robot: Robot, q: Array) -> tuple[list[str], Array]:
@@ -113,5 +129,7 @@ def _trajectory(robot: Robot, path: PosturePath, angles: Array) -> str:
     ]
     if robot.floating:
         lines.append("# The base floats: its pose over time is in path.csv (q:base ...).")
+    if path.strike is not None:
+        lines.append(f"# The contact is at the last point, at {path.strike.contact_s:.9g} s.")
     lines.append(yaml.safe_dump(message, sort_keys=False, default_flow_style=None, width=10**6))
     return "\n".join(lines)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 
 import numpy as np
@@ -16,9 +16,13 @@ from impact_posture.path.path_space import PathSpace
 from impact_posture.path.path_timing import LimitUse, limit_use, timed
 from impact_posture.path.reachable_curve import ReachableCurve
 from impact_posture.path.row_interpolation import INTERPOLATION
+from impact_posture.path.strike import RunUp, Strike, check_strike, run_up
+from impact_posture.path.timed_curve import TimedCurve
 from impact_posture.posture.search.multistart import PostureSolution
 from impact_posture.system.arrays import Array
 
+# Why a path that was reached is not returned.
+_NOT_SMOOTH = "no smooth curve through the path satisfies the constraints"
 # Largest number of optima to try, best first.
 _OPTIMA = 5
 # A path below this tangent length counts as no motion.  A relative gain below the second value counts as no gain.
@@ -47,6 +51,7 @@ class PosturePath:
         max_violation: Largest violation of a constraint or joint limit at the postures.
         use: Shares of the limits over time; ``None`` without a motion.
         objectives: Objective at the times ``use.at``, shape (m,).
+        strike: The impact at the end of the path; ``None`` if the path ends at rest.
     """
 
     found: bool
@@ -62,6 +67,7 @@ class PosturePath:
     max_violation: float
     use: LimitUse | None = None
     objectives: Array = field(default_factory=lambda: np.zeros(0))
+    strike: Strike | None = None
 
     @property
     def duration(self) -> float:
@@ -83,6 +89,7 @@ class PosturePath:
             "objective": self.objective,
             "q": self.q[-1].tolist(),
             "limits": self.use.largest if self.use else {},
+            **({} if self.strike is None else {"strike": self.strike.to_dict()}),
         }
 
 
@@ -93,45 +100,124 @@ def check_package() -> None:
         raise InputError(fault, where="the extra 'path'", hint="pip install 'impact-posture[path]'")
 
 
-def posture_path(solution: PostureSolution, *, seed: int = 0, effort: int = EFFORT) -> PosturePath:
+def posture_path(
+    solution: PostureSolution, *, seed: int = 0, effort: int = EFFORT, strike: float | None = None
+) -> PosturePath:
     """Find a path from ``solution.initial`` to ``solution.q`` along which all constraints hold, and time it.
 
     If the search does not reach the optimum, it tries other certified optima, best first.  If no optimum is reached,
     the path ends at the best reached posture.  For each optimum, the search pulls at most ``effort`` postures onto
     the constraints.
 
+    If ``strike`` is given, the contact point arrives at the optimum with this speed, m/s
+    (:mod:`~impact_posture.path.strike`).  If no optimum can be struck at this speed, the path strikes the optimum
+    with the greatest speed.  If no optimum can be struck at all, the path ends at rest.
+
     Raises:
-        InputError: The package of the extra ``path`` is not installed.
+        InputError: The package of the extra ``path`` is not installed, or the contact cannot strike.
     """
     check_package()
     space, start, objective = PathSpace(solution.problem), solution.initial, solution.problem.objective
-    violated = [name for name, size, tolerance in space.violations(start) if size > tolerance]
-    if violated:
-        return _still(space, objective, start, f"the start violates: {', '.join(violated)}")
+    limits, no_strike = ActuatorLimits(objective, start, solution.problem.requirements), ""
+    if strike is not None:
+        check_strike(solution.problem, strike)
+        struck = _struck(solution, space, limits, strike, seed, effort)
+        if isinstance(struck, PosturePath):
+            return struck
+        no_strike = f"the path ends at rest, because {struck}"
+    if fault := _fault(space, start):
+        return _still(space, objective, start, fault, no_strike)
     connection, failure = _reached(solution, space, seed, effort)
     postures = connection.path or [start]
     if len(postures) == 1:
-        return _still(space, objective, start, failure)
+        return _still(space, objective, start, failure, no_strike)
+    motion = _timed(space, postures, limits, seed)
+    if motion is None:
+        return _still(space, objective, start, _NOT_SMOOTH, no_strike)
+    return _finished(space, motion, connection.method, limits, failure, no_strike)
+
+
+def _fault(space: PathSpace, start: Array) -> str:
+    violated = [name for name, size, tolerance in space.violations(start) if size > tolerance]
+    return f"the start violates: {', '.join(violated)}" if violated else ""
+
+
+def _timed(space: PathSpace, postures: list[Array], limits: ActuatorLimits, seed: int) -> TimedCurve | None:
+    """Return the timed motion along a path from rest to rest; ``None`` if no smooth curve is on the constraints."""
     curve = fitted_curve(space, shortened(space, postures, seed)) or fitted_curve(space, postures)
-    if curve is None:
-        return _still(space, objective, start, "no smooth curve through the path satisfies the constraints")
-    limits = ActuatorLimits(objective, start, solution.problem.requirements)
-    motion = timed(space, curve, limits)
-    rows, use = motion.rows, limit_use(space, motion, limits)
+    return None if curve is None else timed(space, curve, limits)
+
+
+def _finished(
+    space: PathSpace,
+    motion: TimedCurve,
+    method: str,
+    limits: ActuatorLimits,
+    failure: str,
+    *notes: str,
+    strike: Strike | None = None,
+) -> PosturePath:
+    """Return the path with the shares of the limits and the objective along it."""
+    rows, use, objective = motion.rows, limit_use(space, motion, limits), space.problem.objective
     objectives = np.array([objective.value(rows.at(t)[0]) for t in use.at])
-    reason = "; ".join(filter(None, [failure, *motion.notes]))
+    reason = "; ".join(filter(None, [failure, *notes, *motion.notes]))
     end, length, violation = float(objective.value(rows.q[-1])), space.length(rows.q), max(map(space.worst, rows.q))
     return PosturePath(
-        not failure, reason, connection.method, motion.method, end,
-        rows.t, rows.q, rows.v, rows.a, length, violation, use, objectives,
+        not failure, reason, method, motion.method, end,
+        rows.t, rows.q, rows.v, rows.a, length, violation, use, objectives, strike,
     )  # fmt: skip
 
 
-def _still(space: PathSpace, objective: Objective, q: Array, reason: str) -> PosturePath:
-    """Return the path of a robot that stays at its start, which is the optimum if ``reason`` is empty."""
+def _struck(
+    solution: PostureSolution, space: PathSpace, limits: ActuatorLimits, speed: float, seed: int, effort: int
+) -> PosturePath | str:
+    """Return the path that strikes the first optimum with the stated or else the greatest speed; or why none does."""
+    start, objective = solution.initial, solution.problem.objective
+    others = [o.q for o in solution.optima if not np.array_equal(o.q, solution.q)]
+    runs: list[tuple[int, RunUp]] = []
+    first = ""
+    for k, q in enumerate([solution.q, *others[: _OPTIMA - 1]]):
+        target = space.pulled(space.unwound(start, q))
+        if target is None or (k and objective.value(target) >= objective.value(start)):
+            continue
+        run = run_up(solution.problem, target, speed, limits)
+        if isinstance(run, str):
+            first = first or run
+            continue
+        runs.append((k, run))
+        if not run.strike.hindrance:
+            break
+        most = f"at {run.strike.speed:.3g} m/s at most, because of {run.strike.hindrance}"
+        first = first or f"the optimum can be struck {most}"
+    for k, run in sorted(runs, key=lambda each: -each[1].strike.speed):
+        before, begin = run.spaces.approach, run.motion.rows.q[0]
+        if fault := _fault(before, start):
+            first = first or fault
+            continue
+        connection = connect(before, start, begin, seed, effort)
+        if connection.path is None:
+            first = first or "no path to the begin of the run-up was found"
+            continue
+        motion, strike = run.motion, run.strike
+        if before.length(connection.path) > _NO_MOTION:
+            there = _timed(before, connection.path, limits, seed)
+            if there is None:
+                first = first or _NOT_SMOOTH
+                continue
+            shift = float(there.rows.t[-1])
+            motion = TimedCurve(there.rows.followed_by(motion.rows), there.method, (*there.notes, *motion.notes))
+            strike = replace(strike, run_up_s=shift, contact_s=float(motion.rows.t[-1]))
+        failure = f"{first}; the path ends at optimum number {k + 1} of {len(solution.optima)}" if k else ""
+        return _finished(before, motion, connection.method, limits, failure, strike=strike)
+    return first or "no optimum can be struck"
+
+
+def _still(space: PathSpace, objective: Objective, q: Array, failure: str, *notes: str) -> PosturePath:
+    """Return the path of a robot that stays at its start, which is the optimum if ``failure`` is empty."""
     rest = np.zeros((1, space.model.nv))
     value = float(objective.value(q))
-    return PosturePath(not reason, reason, "", "", value, np.zeros(1), q[None], rest, rest, 0.0, space.worst(q))
+    reason = "; ".join(filter(None, [failure, *notes]))
+    return PosturePath(not failure, reason, "", "", value, np.zeros(1), q[None], rest, rest, 0.0, space.worst(q))
 
 
 def _reached(solution: PostureSolution, space: PathSpace, seed: int, effort: int) -> tuple[Connection, str]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
+from impact_posture.path.time_law import DIGITS
 from impact_posture.system.arrays import Array
 
 # Name of the interpolation in files.
@@ -35,6 +36,12 @@ class RowInterpolation:
     q: Array
     v: Array
     a: Array
+
+    def followed_by(self, other: RowInterpolation) -> RowInterpolation:
+        """Return this motion and then ``other``, which begins with the last row of this motion."""
+        t = np.append(self.t, (self.t[-1] + other.t[1:]).round(DIGITS))
+        rows = (np.vstack([getattr(self, key), getattr(other, key)[1:]]) for key in ("q", "v", "a"))
+        return RowInterpolation(self.model, t, *rows)
 
     def at(self, t: float) -> Moment:
         """Return posture, velocity and acceleration at time ``t``, which is limited to the times of the rows."""

@@ -44,7 +44,7 @@ def polynomial(coefficients: Array, duration: float) -> TimeLaw:
     """Return the law whose ``s`` is a polynomial of ``t/T``, with ``coefficients`` from the highest power on."""
     from scipy.interpolate import PPoly
 
-    duration, powers = _whole(duration), np.arange(len(coefficients))[::-1]
+    duration, powers = whole(duration), np.arange(len(coefficients))[::-1]
     scaled = coefficients / duration**powers
     return TimeLaw(PPoly(scaled[:, None], np.array([0.0, duration])), duration)
 
@@ -59,7 +59,7 @@ def stepped(s: Array, rates: Array) -> TimeLaw:
     from scipy.interpolate import PPoly
 
     ends = np.append(0.0, np.cumsum(2 * np.diff(s) / (rates[1:] + rates[:-1])))
-    duration = _whole(float(ends[-1]) + min(RAMP, _SHARE * float(ends[-1])))
+    duration = whole(float(ends[-1]) + min(RAMP, _SHARE * float(ends[-1])))
     ramp = duration - float(ends[-1])
     t = np.unique([*ends, *(ends + ramp)])
     dds = (np.interp(t, ends, rates) - np.interp(t - ramp, ends, rates)) / ramp
@@ -69,6 +69,6 @@ def stepped(s: Array, rates: Array) -> TimeLaw:
     return TimeLaw(progress, duration, np.unique(np.append(at, at + ramp).round(DIGITS)))
 
 
-def _whole(duration: float) -> float:
+def whole(duration: float) -> float:
     """Return a duration that is rounded up to the digits of a time, s."""
-    return float(np.ceil(duration * 10**DIGITS) / 10**DIGITS)
+    return float(np.ceil(duration * 10**DIGITS - 1e-4) / 10**DIGITS)

@@ -63,7 +63,9 @@ def result_document(
     }
     # The posture of posture.json, to which the verdict refers.
     answer = list(postures)[-1]
-    known = Circumstances(attainable[answer], solution.moved, no_path)
+    struck = [] if path is None or "strike" not in path else [path["strike"]["speed"]]  # type: ignore[index]
+    fastest = min([*struck, *([] if attainable[answer] is None else [attainable[answer]])], default=None)
+    known = Circumstances(fastest, solution.moved, no_path)
     fault = [solution.compiler_fault] if solution.compiler_fault else []
     at_posture = posture_warnings(prepared, solution.initial, postures[answer], holding[answer], answer)
     told = (warning for evaluation in evaluations.values() for warning in evaluation.warnings)

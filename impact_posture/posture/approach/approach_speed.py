@@ -27,6 +27,7 @@ class ApproachSpeed(Constraint):
         InputError: There are too few joints to move the contact along the normal.
     """
 
+    at_impact = True
     price = _PRICE
     unit = "m/s"
     # Initial postures are not projected onto this constraint, so that they remain diverse.

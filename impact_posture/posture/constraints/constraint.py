@@ -119,6 +119,7 @@ class Constraint(ABC):
         price: Weight per unit of violation in the search for conflicts.  If constraints conflict, the constraint with
             the lowest weight is violated and therefore reported.
         unit: Unit of a violation in messages.
+        at_impact: Whether the constraint concerns only the impact, and not the motion to it.
     """
 
     name: str
@@ -130,6 +131,7 @@ class Constraint(ABC):
     by_row: bool = False
     price: float = 1.0
     unit: str = ""
+    at_impact: bool = False
 
     @property
     def rows(self) -> int:

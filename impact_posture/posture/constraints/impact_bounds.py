@@ -47,7 +47,7 @@ class ImpactBounds(Constraint):
             no bound.
     """
 
-    by_row = True
+    at_impact = by_row = True
 
     def __init__(self, objective: WorstCaseObjective, largest_mass: float, jump: float, variant: str = "") -> None:
         where = f" ({variant})" if variant else ""

@@ -28,6 +28,7 @@ class KeptContacts(ExpressionConstraint):
     the axes of the soles, which do not change.  ``A`` is divided by the largest impulse at this posture.
     """
 
+    at_impact = True
     unit = "of the largest impulse at the given posture"
 
     def __init__(self, objective: WorstCaseObjective, numeric: Numeric, friction: float, variant: str = "") -> None:

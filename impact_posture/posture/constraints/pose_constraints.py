@@ -54,6 +54,27 @@ class PositionBox(HeldPosition):
         return f"{self.name} along {'xyz'[row]}"
 
 
+class PositionAlong(ExpressionConstraint):
+    """``lower ≤ D (p(q) − p*) ≤ upper`` for directions in the world, the rows of ``D``, shape (k, 3), meters."""
+
+    unit = "m"
+
+    def __init__(
+        self, name: str, point: PointOnLink, target: Array, directions: Array, lower: float, upper: float
+    ) -> None:
+        self.name, self.point, self.directions = name, point, directions
+        self.parameters = np.concatenate([target, directions.ravel()])
+        self.lower, self.upper = np.full(len(directions), lower), np.full(len(directions), upper)
+
+    def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
+        directions = ca.reshape(parameters[3:], 3, self.rows).T
+        return directions @ (tree.position(self.point) - parameters[:3])
+
+    def evaluate(self, model: Numeric) -> tuple[Array, Array]:
+        off = model.placement(self.point).translation - self.parameters[:3]
+        return self.directions @ off, self.directions @ model.jacobian(self.point)[:3]
+
+
 class HeldOrientation(ExpressionConstraint):
     """The frame keeps its world orientation ``target``, shape (3, 3), or only the direction of one axis.
 
@@ -107,7 +128,10 @@ class HeldOrientation(ExpressionConstraint):
 
 
 class HeldPose(ExpressionConstraint):
-    """The frame keeps its position and orientation (six rows), or may spin about ``axis`` (five rows)."""
+    """The frame keeps its position and orientation (six rows), or may spin about ``axis`` (five rows).
+
+    ``orientation`` is the constraint on the orientation alone.
+    """
 
     unit = "in m and rad"
 
@@ -117,6 +141,7 @@ class HeldPose(ExpressionConstraint):
             HeldPosition(name, point, target.translation),
             HeldOrientation(name, point, target.rotation, axis),
         )
+        self.orientation = self._parts[1]
         self.parameters = np.concatenate([p.parameters for p in self._parts])
         self.lower = self.upper = np.zeros(sum(p.rows for p in self._parts))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -173,6 +174,17 @@ class Surroundings:
                 constraints.append(Clearance(name, pairs, text, distances=(distances, indices)))
                 first += len(pairs)
         return constraints
+
+    def fixed_at(self, q: Array) -> Surroundings:
+        """Return these surroundings with surfaces that stay in the world where they are at ``q``, shape (nq,)."""
+        fixed, numeric = copy(self), self._moving.at(q)
+        fixed.__dict__.pop("constraints", None)
+        fixed._walls = []
+        for wall in self._walls:
+            at = wall.body.placement(numeric)
+            still = replace(wall.body, point=PointOnLink(0, at.translation, at.rotation), turns=True)
+            fixed._walls.append(_Wall(still, wall.exempt))
+        return fixed
 
     def closest(self, q: Array) -> dict[str, object]:
         """Return the closest bodies at ``q`` and their distance, m."""

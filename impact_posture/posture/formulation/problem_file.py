@@ -138,11 +138,11 @@ def requirements(settings: ProblemSettings, objective: Objective) -> Requirement
 
 
 def _approaches(settings: ProblemSettings, objective: Objective) -> bool:
-    """Return the setting ``approach``; by default, true if the user gives a speed and the robot does not fly."""
+    """Return the setting ``approach``; by default, true for a stated speed or a strike, unless the robot flies."""
     if settings.approach is not None:
         return settings.approach
     flies = objective.robot.floating and not objective.supports and settings.base != "fixed"
-    return stated(settings.speed) and 0 < settings.speed <= FASTEST and not flies
+    return (stated(settings.speed) or settings.strike) and 0 < settings.speed <= FASTEST and not flies
 
 
 def _largest_mass(settings: ProblemSettings) -> float:

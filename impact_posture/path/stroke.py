@@ -1,0 +1,171 @@
+"""Strokes: the run-up to an impact velocity, and the stop after it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.path.actuator_limits import ActuatorLimits
+from impact_posture.path.path_curve import DEVIATION, PathCurve
+from impact_posture.path.path_space import STEP, PathSpace
+from impact_posture.path.time_law import TimeLaw, polynomial, whole
+from impact_posture.path.timed_curve import moment
+from impact_posture.system.arrays import Array
+
+# Tangent length between two knots of a stroke, and largest tangent length, rad mixed with m.
+_KNOTS, _LONGEST = STEP / 2, 1.5
+# Least number of knots, and how often the length of a curve is halved until its knots suffice.
+_LEAST, _HALVINGS = 8, 3
+# A stroke ends where its velocity exceeds this multiple of the velocity at its posture.
+_FASTER = 3.0
+# A stroke ends where inequalities or joint limits deflect a step by more than this share of its planned length.
+_DEFLECTED = 0.01
+# Singular values below this share of the largest one are zero.
+_RANK = 1e-9
+# Shortest duration of a stroke, s, which a controller can follow.  Ratio of successive trial durations, and number of
+# bisections between two of them.
+_SHORTEST, _LONGER, _BISECTIONS = 0.1, 1.3, 5
+# Number of instants at which a stroke is checked.
+_INSTANTS = 25
+# A stroke uses at most this share of the range of torques and thrusts.  The rest is left to the controller.
+_SHARE = 0.95
+_SINGULAR = "a posture that is nearly singular"
+# Progress over τ = t/T, highest power first: the speed rises as 3τ² − 2τ³ to its end value, or falls from it.
+_RISING, _FALLING = np.array([-1.0, 2.0, 0.0, 0.0, 0.0]), np.array([1.0, -2.0, 0.0, 2.0, 0.0])
+
+
+@dataclass(frozen=True)
+class Need:
+    """The largest share of a limit that a motion needs; ``of`` names the limit."""
+
+    share: float
+    of: str
+
+
+class Stroke:
+    """A smooth curve on the constraints that passes a posture ``q`` with the velocity ``u``, before or after it.
+
+    The curve follows ``dq/db = u + A⁺(q)(A(q₀)u − A(q)u)`` from ``q₀ = q``, the velocity that is nearest to ``u``
+    and for which ``A(q)`` has the same product as at the start.  ``b`` is the time at this velocity, s.
+
+    Args:
+        space: Postures that the curve may pass.
+        q: Posture with the velocity ``u``, shapes (nq,) and (nv,).
+        rows: The matrix ``A``, shape (m, nv), from the model at a posture.
+        time: Length of the curve, as the largest ``b``, s.
+        before: Whether the curve ends at ``q``, instead of beginning there.
+
+    Attributes:
+        curve: The curve; ``None`` if it is too short for a spline.
+        time: Length of the curve, which may be less than desired, s.
+        end: Why the curve is shorter than desired; empty if it is not.
+    """
+
+    def __init__(
+        self, space: PathSpace, q: Array, u: Array, rows: Callable[[Numeric], Array], time: float, *, before: bool
+    ) -> None:
+        self._space, self._u, self._before = space, u, before
+        self.curve: PathCurve | None = None
+        model, numeric = space.model, Numeric(space.model)
+        kept = rows(numeric.at(q)) @ u
+
+        def along(at: Array) -> Array:
+            A = rows(numeric.at(at))
+            return np.asarray(u + np.linalg.pinv(A, rcond=_RANK) @ (kept - A @ u))
+
+        size = float(np.linalg.norm(u))
+        self.time = min(time, _LONGEST / size)
+        count = max(_LEAST, int(np.ceil(self.time * size / _KNOTS)))
+        for _ in range(_HALVINGS + 1):
+            h, postures, self.end = (-1 if before else 1) * self.time / count, [q], ""
+            for _ in range(count):
+                middle = along(np.array(pin.integrate(model, postures[-1], h / 2 * along(postures[-1]))))
+                if np.linalg.norm(middle) > _FASTER * size:
+                    self.end = _SINGULAR
+                    break
+                step = h * middle
+                moved = space.pulled(postures[-1], step)
+                deflected = moved is None or float(np.linalg.norm(space.difference(postures[-1], moved) - step))
+                if moved is None or deflected > _DEFLECTED * abs(h) * size or not space.clear(postures[-1], moved):
+                    self.end = self._obstacle(postures[-1], step)
+                    break
+                postures.append(moved)
+            self.time = abs(h) * (len(postures) - 1)
+            if len(postures) > _LEAST // 2:
+                ends = (None, u * self.time) if before else (u * self.time, None)
+                curve = PathCurve(space, postures[::-1] if before else postures, ends)
+                if curve.deviation() <= DEVIATION:
+                    self.curve = curve
+                    return
+            # A shorter curve has more knots for its length.
+            self.time /= 2
+        self.end = self.end or _SINGULAR
+
+    def _obstacle(self, q: Array, step: Array) -> str:
+        """Return the names of the inequalities that a step violates."""
+        violations = self._space.violations(np.array(pin.integrate(self._space.model, q, step)))
+        held = {c.name for c in self._space.problem.constraints if c.equality}
+        violated = [name for name, size, tolerance in violations if size > tolerance and name not in held]
+        # ``clear`` can also detect a violation between the two postures.
+        return ", ".join(violated) or "a constraint"
+
+    def law(self, duration: float, factor: float = 1.0) -> TimeLaw:
+        """Return the progress from rest to ``factor u``, or from ``factor u`` to rest, without a jump of ``s̈``."""
+        duration = whole(duration)
+        part = factor * duration / 2 / self.time
+        coefficients = part * (_RISING if self._before else _FALLING)
+        coefficients[-1] = 1 - part if self._before else 0.0
+        return polynomial(coefficients, duration)
+
+    def need(self, limits: ActuatorLimits, duration: float, factor: float, stop: bool = False) -> Need:
+        """Return the largest share of a limit at instants of a motion; ``stop`` ends at the first share above 1.
+
+        The velocity at ``q`` counts as permitted, because a velocity jump may exceed the limits.
+        """
+        assert self.curve is not None  # noqa: S101 (narrows a type)
+        robot, law, worst = self._space.problem.robot, self.law(duration, factor), Need(0.0, "")
+        allowed = np.maximum(robot.velocity_limits, factor * np.abs(self._u) * (1 + 1e-9))
+        for t in np.linspace(0.0, law.duration, _INSTANTS):
+            q, v, a = moment(self.curve, law, float(t))
+            speeds = np.abs(v) / allowed
+            needs = [Need(float(speeds.max()), f"the velocity of {robot.tangent_names[int(speeds.argmax())]}")]
+            if not limits.missing:
+                shares = limits.shares(q, limits.load(q, v, a))
+                if shares is None:
+                    needs.append(Need(np.inf, "the balance of the base"))
+                elif shares.size:
+                    k = int(np.abs(shares).argmax())
+                    limit = f"the {limits.kinds[k]} of {limits.names[k]}"
+                    needs.append(Need(float(np.abs(shares[k])) / _SHARE, limit))
+            worst = max([worst, *needs], key=lambda need: need.share)
+            if stop and worst.share > 1:
+                break
+        return worst
+
+    def shortest(self, limits: ActuatorLimits, factor: float = 1.0) -> float | None:
+        """Return the shortest duration within the limits, s; ``None`` if the curve is too short for any."""
+        most = 2 * self.time / factor
+
+        def works(duration: float) -> bool:
+            return self.need(limits, duration, factor, stop=True).share <= 1
+
+        low = high = min(_SHORTEST, most)
+        while not works(high):
+            if high >= most:
+                return None
+            low, high = high, min(_LONGER * high, most)
+        for _ in range(_BISECTIONS if low < high else 0):
+            middle = (low + high) / 2
+            low, high = (low, middle) if works(middle) else (middle, high)
+        return high
+
+    def hindrance(self, limits: ActuatorLimits, factor: float) -> str:
+        """Return what prevents a motion with the velocity ``factor u``: the limit that it exceeds least, and why."""
+        durations = np.geomspace(min(_SHORTEST, self.time / factor), 2 * self.time / factor, 12)
+        least = min((self.need(limits, d, factor) for d in durations), key=lambda need: need.share)
+        room = f"; no longer run-up is possible, because of {self.end}" if self.end else ""
+        return least.of + room

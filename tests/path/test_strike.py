@@ -1,0 +1,263 @@
+"""Strikes: the velocity at the impact, the run-up, and what limits the speed."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.optimize import linprog
+
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.errors import InputError
+from impact_posture.impact.impact_contact import ImpactContact, point_on
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.path.path_files import read_path, write_path
+from impact_posture.path.posture_path import PosturePath, posture_path
+from impact_posture.path.row_interpolation import RowInterpolation
+from impact_posture.path.strike import StrikeSpaces, check_strike, impact_velocity
+from impact_posture.path.stroke import _SHARE
+from impact_posture.posture.constraints.clearance import Clearance
+from impact_posture.posture.constraints.pose_constraints import PositionAlong
+from impact_posture.posture.constraints.requirements import Requirements
+from impact_posture.posture.formulation.build_problem import build_problem
+from impact_posture.posture.formulation.problem_file import prepare
+from impact_posture.posture.program.constrained_problem import ConstrainedProblem, equality_jacobian
+from impact_posture.posture.search.multistart import PostureSolution, solve
+from impact_posture.system.arrays import Array
+from tests.support.command import run
+from tests.support.helpers import robot
+from tests.support.settings import make_settings
+from tests.support.urdfs import joint, link, load, write
+
+SPEED = 0.5
+CASES: dict[str, dict[str, object]] = {
+    "ur5": {"robot": "ur5", "normal": (0, 0, 1), "contact_pose": "aligned", "collision": True, "holdable": True},
+    "panda": {"robot": "panda", "normal": (0, 0, 1), "approach": False},
+    "tilthex_arm": {"robot": "tilthex_arm", "normal": (-1, 0, 0)},
+    "solo8": {"robot": "solo8", "normal": (1, 0, 0), "contact_pose": "position"},
+}
+
+
+@cache
+def struck(name: str) -> tuple[PostureSolution, PosturePath]:
+    solution = solve(prepare(make_settings(CASES[name])).problem, starts=3, jobs=1)
+    return solution, posture_path(solution, strike=SPEED)
+
+
+def contact_of(problem: ConstrainedProblem, q: Array) -> tuple[pin.SE3, Array]:
+    """Return the placement and the Jacobian of the contact point, by Pinocchio's frames."""
+    (contact,), model = problem.objective.contacts, problem.robot.model
+    data, index = model.createData(), model.getFrameId(contact.frame)
+    pin.framesForwardKinematics(model, data, q)
+    J = pin.computeFrameJacobian(model, data, q, index, pin.LOCAL_WORLD_ALIGNED)
+    arm = data.oMf[index].rotation @ np.array(contact.offset)
+    J = np.vstack([J[:3] - pin.skew(arm) @ J[3:], J[3:]])
+    return pin.SE3(data.oMf[index].rotation, data.oMf[index].translation + arm), J
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_path_arrives_at_the_optimum_with_the_stated_velocity(name: str) -> None:
+    solution, path = struck(name)
+    problem, strike = solution.problem, path.strike
+    assert path.found and strike is not None and not strike.hindrance and strike.speed == SPEED
+    assert strike.contact_s == path.t[-1] and np.array_equal(strike.velocity, path.v[-1])
+    assert np.abs(pin.difference(problem.robot.model, path.q[-1], solution.q)).max() < 1e-8
+    n = np.array(problem.objective.contacts[0].normal)
+    twist = contact_of(problem, path.q[-1])[1] @ path.v[-1]
+    assert np.abs(twist[:3] + SPEED * n).max() < 1e-9
+    pose = problem.requirements.contact_pose
+    turning = {"full": np.eye(3), "aligned": np.eye(3) - np.outer(n, n), "position": np.zeros((3, 3))}[pose]
+    assert np.abs(turning @ twist[3:]).max() < 1e-9
+    assert np.isfinite(problem.robot.velocity_limits).any()
+    share = float((np.abs(path.v[-1]) / problem.robot.velocity_limits).max())
+    assert share == pytest.approx(strike.share, abs=1e-9) and share <= 1
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_run_up_is_straight_and_clear_and_keeps_feet_and_base(name: str) -> None:
+    solution, path = struck(name)
+    problem, strike = solution.problem, path.strike
+    assert strike is not None
+    n, model = np.array(problem.objective.contacts[0].normal), problem.robot.model
+    rows = RowInterpolation(model, path.t, path.q, path.v, path.a)
+    home = contact_of(problem, path.q[-1])[0]
+    times = np.linspace(strike.run_up_s, strike.contact_s, 40)
+    heights = []
+    for t in times:
+        q, v, _ = rows.at(t)
+        at, J = contact_of(problem, q)
+        off = at.translation - home.translation
+        heights.append(float(n @ off))
+        assert np.linalg.norm(off - heights[-1] * n) < 1e-5
+        if problem.requirements.contact_pose == "full":
+            assert np.abs(pin.log3(at.rotation.T @ home.rotation)).max() < 1e-5
+        # The speed rises as 3τ² − 2τ³.
+        share = (t - strike.run_up_s) / (strike.contact_s - strike.run_up_s)
+        assert -n @ J[:3] @ v == pytest.approx(SPEED * (3 * share**2 - 2 * share**3), abs=5e-3 * SPEED)
+        for constraint in problem.constraints[: len(problem.objective.supports)]:
+            assert np.abs(constraint.value(Numeric(model).at(q))).max() < 1e-5
+        if problem.surroundings is not None:
+            assert not problem.surroundings.collisions(q)
+    assert heights[0] == pytest.approx(strike.run_up_m, rel=1e-3) and (np.diff(heights) < 0).all()
+    # The robot leaves the begin of the run-up from rest, and the contact never enters the surface before.
+    assert np.abs(rows.at(strike.run_up_s)[1]).max() < 1e-9
+    assert min(n @ (contact_of(problem, q)[0].translation - home.translation) for q in path.q) > -1e-6
+
+
+@pytest.mark.parametrize("name", ["ur5", "panda"])
+def test_the_velocity_at_the_impact_needs_the_least_share_of_the_limits(name: str) -> None:
+    """The oracle is the linear program in all velocities, solved by SciPy."""
+    solution, path = struck(name)
+    problem, strike = solution.problem, path.strike
+    assert strike is not None
+    q, nv, limit = path.q[-1], problem.robot.nv, problem.robot.velocity_limits
+    J, n = contact_of(problem, q)[1], np.array(problem.objective.contacts[0].normal)
+    held = [c.evaluate(Numeric(problem.robot.model).at(q))[1] for c in problem.constraints if c.equality]
+    tilt = np.vstack(held)[3:] if problem.requirements.contact_pose != "position" else np.zeros((0, nv))
+    A = np.column_stack([np.vstack([J[:3], tilt]), np.zeros(3 + len(tilt))])
+    bounds = [(None, None)] * nv + [(0, None)]
+    sides = np.vstack([np.column_stack([sign * np.diag(1 / limit), -np.ones(nv)]) for sign in (1, -1)])
+    b = np.concatenate([-SPEED * n, np.zeros(len(tilt))])
+    best = linprog(np.eye(nv + 1)[-1], sides, np.zeros(2 * nv), A, b, bounds)
+    assert best.status == 0 and best.fun - 1e-7 <= strike.share <= 1.01 * best.fun
+
+
+def test_velocities_that_leave_an_active_bound_are_preferred() -> None:
+    """A limit of a joint at the optimum allows only run-ups away from the limit."""
+    solution, path = struck("panda")
+    at, worst = path.q[-1], int(np.abs(path.v[-1]).argmax())
+    sign, lower, upper = np.sign(path.v[-1][worst]), solution.problem.lower.copy(), solution.problem.upper.copy()
+    # The run-up comes from q − t ν, which this limit forbids.
+    (lower if sign > 0 else upper)[worst] = at[worst]
+    blocked = replace(solution.problem, lower=lower, upper=upper)
+    velocity = impact_velocity(StrikeSpaces(blocked, at), at, SPEED)
+    assert velocity is None or sign * velocity[0][worst] <= 1e-9
+
+
+WALL = 'default_posture = "wall"\n[postures.wall]\njoints = { slide = 0.0 }\n[contact]\nframe = "cart"\n'
+
+
+def cart(effort: float, speed: float) -> tuple[str, ...]:
+    """Return a mass of 2 kg on a slider towards a wall at 0; it can back off by 0.1 m."""
+    limit = f'<limit lower="-0.1" upper="1" effort="{effort}" velocity="{speed}"/>'
+    return link("base"), link("cart", 2.0), joint("slide", "base cart", "1 0 0", "0 0 1", "prismatic", limit)
+
+
+def slider(folder: Path, effort: float, speed: float) -> PostureSolution:
+    loaded = load(folder, *cart(effort, speed), toml=WALL)
+    objective = WorstCaseObjective(loaded, ImpactContact("cart", (-1, 0, 0)))
+    problem = build_problem(loaded, objective, loaded.posture(), Requirements(contact_pose="position"))
+    return solve(problem, starts=1, jobs=1)
+
+
+def test_the_greatest_speed_of_a_cart_follows_from_its_run_up(tmp_path: Path) -> None:
+    """The speed 3τ² − 2τ³ over a length L has the acceleration 3/4 v²/L, which the force of the motor bounds."""
+    path = posture_path(slider(tmp_path, 4.0, 9.0), strike=2.0)
+    strike = path.strike
+    greatest = np.sqrt(_SHARE * 4.0 / 2.0 * 0.1 / 0.75)
+    assert strike is not None and strike.speed == pytest.approx(greatest, rel=0.02) and strike.speed < greatest
+    assert strike.hindrance == "the torque of slide; no longer run-up is possible, because of joint limits"
+    assert strike.run_up_m == pytest.approx(0.1, rel=0.05) and path.found
+
+
+def test_a_velocity_limit_bounds_the_speed(tmp_path: Path) -> None:
+    path = posture_path(slider(tmp_path, 4000.0, 0.7), strike=2.0)
+    assert path.strike is not None and path.strike.hindrance == "the velocity of slide"
+    assert path.strike.speed == pytest.approx(0.7, rel=1e-6) and path.strike.share == pytest.approx(1.0)
+
+
+def test_a_motor_that_cannot_move_the_cart_ends_the_path_at_rest(tmp_path: Path) -> None:
+    """At rest the start is the optimum."""
+    path = posture_path(slider(tmp_path, 1e-9, 9.0), strike=2.0)
+    assert path.strike is None and len(path.t) == 1
+
+
+def test_directions_of_a_position_have_the_derivative_of_finite_differences() -> None:
+    loaded, h = robot("panda"), 1e-6
+    q, D = loaded.posture() + 0.1, np.random.default_rng(1).normal(size=(2, 3))
+    row = PositionAlong("along", point_on(loaded, "panda_hand_tcp", (0.01, 0.02, 0.03)), np.ones(3), D, 0.0, 1.0)
+    numeric = Numeric(loaded.model)
+    J = row.evaluate(numeric.at(q))[1]
+    steps = [h * unit for unit in np.eye(loaded.nv)]
+    moved = [row.value(numeric.at(pin.integrate(loaded.model, q, step))) for step in steps]
+    back = [row.value(numeric.at(pin.integrate(loaded.model, q, -step))) for step in steps]
+    np.testing.assert_allclose(J, (np.array(moved) - back).T / (2 * h), atol=1e-8)
+
+
+def test_the_surface_stays_in_the_world_while_the_contact_backs_off() -> None:
+    """The surface of the problem follows the contact point, so it is nearer to the other links by the run-up."""
+    (solution, path), numeric = struck("ur5"), Numeric(robot("ur5").model)
+    spaces, strike = StrikeSpaces(solution.problem, path.q[-1]), path.strike
+    assert strike is not None
+    numeric.at(path.q[int(np.searchsorted(path.t, strike.run_up_s))])
+    surfaces = [
+        next(c for c in problem.constraints if isinstance(c, Clearance) and c.name.startswith("surface"))
+        for problem in (spaces.run_up.problem, solution.problem)
+    ]
+    (name, fixed), (same, moving) = (surface.closest(numeric) for surface in surfaces)
+    assert name == same and fixed - moving == pytest.approx(strike.run_up_m, rel=1e-3)
+
+
+def test_files_mark_the_contact(tmp_path: Path) -> None:
+    solution, path = struck("solo8")
+    loaded, strike = solution.problem.robot, path.strike
+    assert strike is not None
+    write_path(tmp_path, loaded, path)
+    with (tmp_path / "path.csv").open(newline="") as file:
+        table = list(csv.DictReader(file))
+    assert [row["contact"] for row in table] == [*["0"] * (len(path.t) - 1), "1"]
+    assert float(table[-1]["t"]) == np.load(tmp_path / "path.npz")["contact"] == strike.contact_s
+    assert f"# The contact is at the last point, at {strike.contact_s:.9g} s." in (tmp_path / "path.yaml").read_text()
+    block = json.loads(json.dumps(path.to_dict(), allow_nan=False))
+    assert read_path(tmp_path, block, loaded).to_dict() == path.to_dict()
+    page = (Path(__file__).parents[2] / "docs" / "reference" / "result-json.md").read_text(encoding="utf-8")
+    (row,) = (line for line in page.splitlines() if line.startswith("| `path.strike`"))
+    assert all(f"`{key}`" in row for key in block["strike"])
+    block["strike"]["velocity"].pop()
+    with pytest.raises(ValueError, match="does not fit solo8"):
+        read_path(tmp_path, block, loaded)
+
+
+def test_the_command_prints_the_strike_and_what_bounds_it(tmp_path: Path) -> None:
+    robot_file = write(tmp_path, *cart(4.0, 9.0), toml=WALL)
+    options = "--normal -1 0 0 --contact-pose position --no-holdable --no-approach --speed 2 --no-codegen --no-report"
+    command = ("optimize", robot_file, *options.split(), "--format", "png", "--strike")
+    idle = run(*command, cwd=tmp_path)
+    assert idle.returncode == 2 and "'--strike': does nothing without --path" in " ".join(idle.stderr.split())
+    done = run(*command, "--path", "--out", "out", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    text = " ".join(done.stdout.split())
+    assert "strikes at 0.5 m/s, with 6% of the velocity limits" in text
+    assert "2 m/s is not possible, because of the torque of slide" in text
+    document = json.loads((tmp_path / "out" / "result.json").read_text())
+    assert "strike = true" in (tmp_path / "out" / "problem.toml").read_text()
+    # The verdict states first that the stated speed is not reached.
+    assert document["verdict"]["line"].startswith("verdict: cannot arrive at 2 m/s (0.5 m/s at most)")
+
+
+@pytest.mark.parametrize(
+    ("settings", "speed", "words"),
+    [
+        ({"contact_pose": "free"}, 1.0, "`contact_pose` is free"),
+        ({"contact_pose": "position"}, 0.0, "speed above zero"),
+        ({"normal": None, "contact": ("panda_hand_tcp:0,0,1", "panda_link4:1,0,0")}, 1.0, "several"),
+    ],
+)
+def test_a_contact_that_cannot_strike_is_refused(settings: dict[str, object], speed: float, words: str) -> None:
+    problem = prepare(make_settings({"robot": "panda", "normal": (0, 0, 1), **settings})).problem
+    with pytest.raises(InputError, match=words):
+        check_strike(problem, speed)
+
+
+def test_equalities_of_the_run_up_leave_the_normal_free() -> None:
+    solution, path = struck("panda")
+    spaces = StrikeSpaces(solution.problem, path.q[-1])
+    rows = equality_jacobian(spaces.run_up.problem, Numeric(solution.problem.robot.model).at(path.q[-1]))
+    held = equality_jacobian(solution.problem, Numeric(solution.problem.robot.model).at(path.q[-1]))
+    assert np.linalg.matrix_rank(rows, tol=1e-7) == np.linalg.matrix_rank(held, tol=1e-7) - 1
