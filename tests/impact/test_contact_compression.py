@@ -149,6 +149,20 @@ def test_a_joint_model_that_does_not_fit_is_named_with_both_answers(stiffness: f
             assert all(f"{value:.4g} with '{other}'" in lines[0] for other, value in values.items())
 
 
+def test_a_contact_given_by_a_material_names_the_assumed_tip() -> None:
+    loaded = elastic("panda")
+    objective = WorstCaseObjective(loaded, ImpactContact("panda_hand_tcp", (0, 0, 1)))
+    for contact, named in (
+        (None, True),
+        (ContactStiffness.of("wood", None), True),
+        (ContactStiffness.of(1e6, None), False),
+        (ContactStiffness.of(None, 0.0125), False),
+    ):
+        result = compression(objective, loaded.posture(), 1.0, contact)
+        assert result is not None and ("steel tip of 10 mm radius" in result.line) == named
+        assert ("`contact_duration`" in result.line) == (contact is None)
+
+
 def test_unknown_values_are_none() -> None:
     loaded = robot("tilthex_arm")
     objective = WorstCaseObjective(loaded, ImpactContact("ee", (0, 0, 1)))

@@ -38,6 +38,8 @@ from impact_posture.system.arrays import Array
 HERTZ_TIME = sqrt(pi) * gamma(7 / 5) / gamma(9 / 10)
 # Radius of the steel tip on the robot, m; a contact given by a material assumes this tip.
 TIP_RADIUS = 0.01
+# Recorded hits of a flat tool lasted 25 ms, so x was 1.7 and not 0.06 (docs: a real robot).
+_TIP_ONLY = f"a flat or padded tool touches longer than the assumed steel tip of {1e3 * TIP_RADIUS:g} mm radius"
 # A joint whose jump is below this fraction of the largest jump of a joint does not determine x.
 _MOVED = 0.1
 # For x up to SHORT, only the links respond.  For x from LONG, the rotors respond too (docs: which inertia).
@@ -181,7 +183,8 @@ class Compression:
             if not self.by_material:
                 return ""
             each = ", ".join(f"{float(f'{x:.2g}'):g} on {name}" for name, x in self.by_material.items())
-            return f"x = {each} (up to {SHORT:g} only the links respond, from {LONG:g} links and rotors)"
+            ranges = f"up to {SHORT:g} only the links respond, from {LONG:g} links and rotors"
+            return f"x = {each} ({ranges}); {_TIP_ONLY}: state `contact_duration`"
         if self.fitting == "link":
             meaning = "the contact is over before the rotors move: joint model 'link'"
         elif self.fitting == "reflected":
@@ -190,7 +193,8 @@ class Compression:
             used = self.joint_model == "elastic"
             advice = "'elastic', which is used here, is" if used else "evaluate with `joint_model` elastic"
             meaning = f"neither 'link' nor 'reflected' is accurate; {advice}"
-        return f"x = {self.x:.2g}: {meaning}"
+        tip = f"; {_TIP_ONLY}" if self.contact is not None and self.contact.material else ""
+        return f"x = {self.x:.2g}: {meaning}{tip}"
 
     def to_dict(self) -> dict[str, object]:
         """Return JSON content."""
