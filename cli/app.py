@@ -10,6 +10,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from impact_posture_cli.argv import split_vectors
 from impact_posture_cli.commands import COMMANDS
+from impact_posture_cli.output import use_options
 
 
 def load(name: str) -> Any:
@@ -36,6 +37,7 @@ class CommandGroup(TyperGroup):
         name, _, rest = super().resolve_command(ctx, args)
         command = build(str(name))
         lengths = {option: p.nargs for p in command.params if p.nargs > 1 for option in p.opts}
+        use_options(option for p in command.params for option in (*p.opts, *p.secondary_opts))
         return name, command, split_vectors(rest, lengths)
 
 

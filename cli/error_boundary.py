@@ -88,9 +88,7 @@ def _explain(error: Exception, arguments: Sequence[str]) -> _Fault:
         where = option + error.where[len(option) - 2 :] if typed else error.where
         return _Fault(error.exit_code, kind, as_options(error.what), where, as_options(error.hint))
     if isinstance(error, OSError):
-        hint = "free some space" if error.errno == errno.ENOSPC else "check the path and its permissions"
-        where = str(error.filename) if error.filename is not None else ""
-        return _Fault(1, kind, error.strerror or str(error), where, hint)
+        return _Fault(1, kind, error.strerror or str(error), *_place_and_hint(error))
     if isinstance(error, MemoryError) or "bad_alloc" in str(error):
         hint = "free some, raise its limit (ulimit -v), or give fewer --jobs"
         return _Fault(1, "MemoryError", "out of memory", hint=hint)
@@ -99,6 +97,18 @@ def _explain(error: Exception, arguments: Sequence[str]) -> _Fault:
     what = f"{kind}: {error}" if str(error) else kind
     hint = f"please report it with the output of {DEBUG_VARIABLE}=1"
     return _Fault(1, "InternalError", what, "internal error", hint)
+
+
+def _place_and_hint(error: OSError) -> tuple[str, str]:
+    """Return the file of an error, and a hint.  Calls that read a deleted current folder name no file."""
+    where, hint = str(error.filename or ""), "check the path and its permissions"
+    if not where:
+        hint = f"{DEBUG_VARIABLE}=1 shows where"
+        try:
+            os.getcwd()
+        except OSError:
+            where, hint = "the current folder", "it was deleted: change to another folder"
+    return where, "free some space" if error.errno == errno.ENOSPC else hint
 
 
 def _usage(error: Any, wants_json: bool) -> int:

@@ -16,9 +16,27 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 
+# Options of the subcommand that runs; empty before a subcommand is known.
+_OPTIONS: set[str] = set()
+
+
+def use_options(options: Iterable[str]) -> None:
+    """State the options of the subcommand that runs, for :func:`as_options`."""
+    _OPTIONS.clear()
+    _OPTIONS.update(options)
+
+
 def as_options(text: str) -> str:
-    """Replace each parameter name in backquotes by its option, for example ```out``` by ``--out``."""
-    return re.sub(r"(no )?`(\w+)`", lambda m: f"--{'no-' if m[1] else ''}{m[2].replace('_', '-')}", text)
+    """Replace each parameter name in backquotes by its option, for example ```out``` by ``--out``.
+
+    If the subcommand has no such option, the parameter is the key of a file, and the name is printed in quotes.
+    """
+
+    def name(match: re.Match[str]) -> str:
+        option = f"--{'no-' if match[1] else ''}{match[2].replace('_', '-')}"
+        return option if not _OPTIONS or option in _OPTIONS else f"{match[1] or ''}'{match[2]}'"
+
+    return re.sub(r"(no )?`(\w+)`", name, text)
 
 
 def print_json(document: object) -> None:

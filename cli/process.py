@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import re
 import resource
 import signal
 import sys
@@ -22,6 +23,9 @@ def prepare() -> None:
     _open_streams()
     # Always use the file backend, because a notebook backend or a missing backend in the environment would fail.
     os.environ["MPLBACKEND"] = "agg"
+    # Rich makes lines of this width, which fill the memory if it is huge, and are empty if it is zero.
+    if not re.fullmatch(r"[1-9]\d{0,3}", os.environ.get("COLUMNS", "80")):
+        del os.environ["COLUMNS"]
     # Threads of the linear algebra do not help with small matrices, but they use memory and can fail to start.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     for number in _WORDS:

@@ -52,7 +52,7 @@ def optimize(
     from impact_posture.api.posture_problem import PostureProblem
     from impact_posture.api.posture_result import optimize as solve
     from impact_posture.output.result_folder import FORMATS, default_out
-    from impact_posture.posture.formulation.problem_file import prepare
+    from impact_posture.posture.formulation.problem_file import dump_settings, prepare, resolved_settings
     from impact_posture.system.output_folder import check_output
 
     if settings.path:
@@ -69,6 +69,8 @@ def optimize(
         check_strike(prepared.problem, prepared.impact.speed)
     folder = Path(out) if out else default_out(prepared)
     check_output(folder, force=force, kind="result")
+    # A name that TOML forbids is an error before the search, not after it.
+    dump_settings(resolved_settings(prepared))
     announce(page, prepared)
     with page.progress("solving", "starts", first="building the expressions") as advance:
         result = solve(

@@ -41,7 +41,12 @@ def validate(cls: type[_Table], data: object, where: str) -> _Table:
 
     try:
         # Pass the table as JSON, because strict dataclasses do not accept Python dictionaries.
-        text = json.dumps(data, default=_plain)
+        text = json.dumps(data, default=_plain, ensure_ascii=False)
+        text.encode("utf-8")
+    except UnicodeEncodeError as error:
+        before, after = text[: error.start].rpartition('"')[2], text[error.start :].partition('"')[0]
+        hint = "rename the file or folder"
+        raise SpecError(f"'{shown(before + after)}' is not UTF-8", where=where, hint=hint) from None
     except ValueError as error:  # An integer has more digits than Python converts.
         raise SpecError(f"cannot be read ({error})", where=where, hint="correct the value") from None
     try:

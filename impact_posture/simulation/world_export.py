@@ -35,12 +35,15 @@ def export_world(setup: Setup, out: Path, *, force: bool = False) -> None:
         InputError: The scenario throws a ball, or a joint is neither revolute, prismatic nor a floating base.
         OutputError: The folder exists and ``force`` is false, contains other files, or cannot be written.
     """
-    mjcf = setup.world.built.mjcf
+    mujoco, mjcf = import_mujoco(), setup.world.built.mjcf
     model = mjcf.compile()
     lines = [" ".join([key, *map(repr, map(float, values))]) for key, values in _parameters(setup, model)]
     with whole_folder(out, force=force, kind="world") as folder:
         (folder / "world.xml").write_text(mjcf.spec.to_xml(), encoding="utf-8")
-        import_mujoco().mj_saveModel(model, str(folder / MODEL))
+        # MuJoCo itself cannot open a file if the path is not UTF-8.
+        content = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+        mujoco.mj_saveModel(model, None, content)
+        (folder / MODEL).write_bytes(content.tobytes())
         (folder / PARAMETERS).write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 

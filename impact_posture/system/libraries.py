@@ -10,14 +10,18 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import os
+import re
 import stat
 import struct
+import subprocess
+import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from functools import cache
 from pathlib import Path
 
-from impact_posture.errors import OutputError, SpecError
+from impact_posture.errors import CompilerError, OutputError, SpecError
+from impact_posture.system.folder_record import sha256_of
 from impact_posture.system.scratch_folder import scratch_folder
 from impact_posture.system.toolchain import require_compiler, run_compiler, run_compilers, words_of
 from impact_posture.version import __version__
@@ -49,6 +53,7 @@ def build_library(folder: Path, prefix: str, library: Path | None = None, flags:
         run_compiler(
             [*compiler, *_FLAGS, "-shared", *words_of("CFLAGS"), *flags, f"{prefix}.c", "-o", output, "-lm"], folder
         )
+        _check_sanitizer(Path(output))
     return library
 
 
@@ -80,6 +85,7 @@ def build_parts(folder: Path, library: Path, parts: Mapping[str, Sequence[str]])
             outputs = [str(finished.enter_context(building(part)) / part.name) for part in missing]
             run_compilers([[*c, "-c", "-o", out] for c, out in zip(missing.values(), outputs, strict=True)], folder)
         run_compiler([*compiler, "-shared", *map(str, objects), "-o", str(scratch / library.name), "-lm"], folder)
+        _check_sanitizer(scratch / library.name)
     return library
 
 
@@ -104,7 +110,7 @@ def building(library: Path) -> Iterator[Path]:
 
 
 def _replace(library: Path, built: Path) -> None:
-    hash_path(built).write_text(f"{_sha256(built)}  {library.name}\n", encoding="utf-8")
+    hash_path(built).write_text(f"{sha256_of(built)}  {library.name}\n", encoding="utf-8")
     hash_path(library).unlink(missing_ok=True)
     os.replace(built, library)
     os.replace(hash_path(built), hash_path(library))
@@ -121,18 +127,35 @@ def has_its_hash(library: Path) -> bool | None:
         words = hash_path(library).read_text(encoding="utf-8", errors="replace").split()
     except FileNotFoundError:
         return None
-    return words[:1] == [_sha256(library)]
+    return words[:1] == [sha256_of(library)]
 
 
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+def _check_sanitizer(library: Path) -> None:
+    """Check that another process can load a library that needs the runtime of a sanitizer.
+
+    The runtime of AddressSanitizer ends a process that does not load it first, without an exception.
+
+    Raises:
+        CompilerError: Loading the library ends the process.
+    """
+    if not re.search(rb"san\.so|__[a-z]+san_", library.read_bytes()):
+        return
+    program = "import ctypes, sys; ctypes.CDLL(sys.argv[1])"
+    trial = subprocess.run(
+        [sys.executable, "-I", "-c", program, str(library)], capture_output=True, text=True, errors="replace",
+        check=False,
+    )  # fmt: skip
+    if trial.returncode:
+        reason = trial.stderr.strip().rpartition("\n")[2] or f"exit code {trial.returncode}"
+        hint = "leave -fsanitize out of CFLAGS and CC, or preload the runtime"
+        raise CompilerError(f"cannot be loaded ({reason})", where=library.name, hint=hint)
 
 
 def load_library(library: Path) -> ctypes.CDLL:
     """Load a shared library.  Loading runs code of the library.
 
     Raises:
+        CompilerError: The library needs a sanitizer, whose runtime would end this process.
         SpecError: The library differs from the SHA-256 beside it, is truncated, or cannot be loaded.
     """
     hint = "delete this file, so that it is built again"
@@ -144,6 +167,7 @@ def load_library(library: Path) -> ctypes.CDLL:
         elif unchanged is None and _is_truncated(library):
             fault = "is truncated (shorter than its ELF header states)"
         else:
+            _check_sanitizer(library)
             return ctypes.CDLL(str(library.absolute()))
     except OSError as error:
         fault = f"cannot be loaded ({error.strerror or error})"
@@ -166,15 +190,25 @@ def _is_truncated(library: Path) -> bool:
 
 
 def cache_path() -> Path:
-    """Return the path of the cache: ``$IMPACT_POSTURE_CACHE``, or else a folder in the user's cache folder."""
-    if chosen := os.environ.get("IMPACT_POSTURE_CACHE"):
-        return Path(chosen).absolute()
+    """Return the path of the cache: ``$IMPACT_POSTURE_CACHE``, or else a folder in the user's cache folder.
+
+    Raises:
+        OutputError: The user has no home folder, or the path is not UTF-8, which CasADi requires.
+    """
     # The XDG specification says to ignore a relative path.
     base = Path(os.environ.get("XDG_CACHE_HOME", ""))
     try:
-        return (base if base.is_absolute() else Path.home() / ".cache") / "impact-posture"
+        if chosen := os.environ.get("IMPACT_POSTURE_CACHE"):
+            path = Path(chosen).absolute()
+        else:
+            path = (base if base.is_absolute() else Path.home() / ".cache") / "impact-posture"
+        str(path).encode("utf-8")
     except RuntimeError:
         raise OutputError("there is no home folder", where="cache", hint="set IMPACT_POSTURE_CACHE") from None
+    except UnicodeEncodeError:
+        hint = "set IMPACT_POSTURE_CACHE to another folder"
+        raise OutputError("is not UTF-8", where=str(path), hint=hint) from None
+    return path
 
 
 def cache_folder(*parts: str) -> Path:

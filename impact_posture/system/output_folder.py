@@ -74,7 +74,7 @@ def check_name(out: Path) -> None:
     except (FileNotFoundError, NotADirectoryError):
         pass
     except (OSError, ValueError) as error:
-        raise OutputError.unwritable(out, error, "choose another `out`") from None
+        raise OutputError.unwritable(out, error, "choose another name") from None
 
 
 @contextmanager
@@ -272,7 +272,7 @@ def used_alone(folder: Path, lock: Path) -> Iterator[None]:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            hint = "wait until it ends, or choose another `out`"
+            hint = "wait until it ends, or choose another folder"
             raise OutputError("is in use by another command", where=str(folder), hint=hint) from None
         except OSError:
             # Some file systems do not support locks.  On them, the folder is not locked.
@@ -297,5 +297,5 @@ def parents_of(out: Path) -> Iterator[None]:
             for folder in reversed(missing):
                 folder.mkdir(exist_ok=True)
         except OSError as error:
-            raise OutputError.unwritable(Path(error.filename), error, "choose another `out`") from None
+            raise OutputError.unwritable(Path(error.filename), error, "choose another folder") from None
         yield

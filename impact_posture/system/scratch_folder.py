@@ -60,7 +60,11 @@ def scratch_folder(parent: Path | None = None, mode: int = 0o700) -> Iterator[Pa
                 fcntl.flock(record, fcntl.LOCK_EX)
             # Lock the record before writing it.  Until then, the record is empty, and other processes ignore it.
             content = {"schema": SCHEMA, "host": os.uname().nodename, **made_by()}
-            os.write(record, json.dumps(content).encode())
+            try:
+                os.write(record, json.dumps(content).encode())
+            except OSError as error:
+                # ``os.write`` does not know the name of the file.
+                raise OSError(error.errno, error.strerror, str(folder)) from None
             yield folder
         finally:
             os.close(record)

@@ -10,8 +10,8 @@ import pytest
 
 from impact_posture.sweep.sweep_file import read_sweep
 from impact_posture.sweep.sweep_run import run_sweep
+from impact_posture_cli.app import build
 from tests.hostile.arena import SMALL, strike
-from tests.support.command import PARSER
 
 SWEEP = """
 [problem]
@@ -117,5 +117,4 @@ def test_a_sweep_replaces_another_sweep_by_force(press: Path, arena: Path) -> No
 
 @pytest.mark.parametrize("name", ["plot", "report", *{argv[0] for argv in WHOLE.values()}, "inspect"])
 def test_each_command_that_writes_has_force(name: str) -> None:
-    options = PARSER.resolve_command(None, [name])[1].params
-    assert any("--force" in option.opts for option in options)
+    assert any("--force" in option.opts for option in build(name).params)
