@@ -54,18 +54,21 @@ def compare(
         warnings = controller_factory(scenario).setup.warnings
     page.warnings(warnings)
     beside = nullcontext() if folder is None else store_beside(folder)
-    with beside as store, page.progress("running", "runs") as advance:
-        reproduction = reproduce(plan, seeds=seeds, processes=jobs, store=store, progress=advance, compile=compile)
-        if folder is not None and store is not None:
-            output = Output(folder, force, format or FORMATS, not no_report, meshes)
-            failure = write_comparison(output, reproduction, store)
-    page.warnings([failure and f"there is no report.html: {failure}"])
-    if json:
-        print_json(reproduction.comparison())
-        return
-    rows = reproduction.rows
-    page.title(rows[0].scenario, statistic(seeds, [metric for row in rows for metric in row.metrics.values()]))
-    rows_table(page, rows)
-    if folder is not None:
-        page.gap()
-        page.line(f"written: {folder}")
+    with beside as store:
+        with page.progress("running", "runs") as advance:
+            reproduction = reproduce(
+                plan, seeds=seeds, processes=jobs, store=store, progress=advance, compile=compile
+            )
+            if folder is not None and store is not None:
+                output = Output(folder, force, format or FORMATS, not no_report, meshes)
+                failure = write_comparison(output, reproduction, store)
+        page.warnings([failure and f"there is no report.html: {failure}"])
+        if json:
+            print_json(reproduction.comparison())
+            return
+        rows = reproduction.rows
+        page.title(rows[0].scenario, statistic(seeds, [metric for row in rows for metric in row.metrics.values()]))
+        rows_table(page, rows)
+        if folder is not None:
+            page.gap()
+            page.line(f"written: {folder}")

@@ -42,21 +42,22 @@ def reproduce(
     folder = Path(out)
     check_output(folder, force=force, kind="reproduction")
     page = Page(json=json, quiet=quiet)
-    with store_beside(folder) as store, page.progress("running", "runs") as advance:
-        plan = {name: controllers_of(name, all_) for name in scenarios}
-        reproduction = reproduce_all(
-            plan, seeds=seeds, processes=jobs, store=store, progress=advance, compile=compile
-        )
-        document = write_reproduction(Output(folder, force, format or FORMATS), reproduction, store)
-    if json:
-        print_json(document)
-        return
-    for name in scenarios:
-        paper = PAPER[name]
-        page.title(name, f"the paper: {paper.nominal:g} to {paper.robust:g}, {100 * paper.reduction:.1f} % less")
-        rows_table(page, reproduction.of(name))
+    with store_beside(folder) as store:
+        with page.progress("running", "runs") as advance:
+            plan = {name: controllers_of(name, all_) for name in scenarios}
+            reproduction = reproduce_all(
+                plan, seeds=seeds, processes=jobs, store=store, progress=advance, compile=compile
+            )
+            document = write_reproduction(Output(folder, force, format or FORMATS), reproduction, store)
+        if json:
+            print_json(document)
+            return
+        for name in scenarios:
+            paper = PAPER[name]
+            page.title(name, f"the paper: {paper.nominal:g} to {paper.robust:g}, {100 * paper.reduction:.1f} % less")
+            rows_table(page, reproduction.of(name))
+            page.gap()
+        for line in advice(reproduction):
+            page.line(line.replace("**", "").replace("`", ""))
         page.gap()
-    for line in advice(reproduction):
-        page.line(line.replace("**", "").replace("`", ""))
-    page.gap()
-    page.line(f"written: {folder}; read {folder / 'SUMMARY.md'}")
+        page.line(f"written: {folder}; read {folder / 'SUMMARY.md'}")

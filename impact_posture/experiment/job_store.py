@@ -27,6 +27,8 @@ from impact_posture.system.text_files import read_text
 Progress = Callable[[int, int], None]
 # Pattern of the names of stored files, and of incomplete files that a killed process leaves.
 _STORED = re.compile(r"\.?[0-9a-f]{64}(\.minus)?\.(json|npz)(\.\d+\.part)?")
+# Errors that a document of another structure causes.
+_BROKEN = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError)
 
 
 class JobStore:
@@ -37,19 +39,26 @@ class JobStore:
     """
 
     def __init__(self, folder: Path) -> None:
-        self.folder = folder
+        self.folder, self._used = folder, False
 
     @contextmanager
     def locked(self) -> Iterator[JobStore]:
         """Create the folder and lock it against other commands.  Remove the folder at the end if it is empty.
 
         Raises:
-            OutputError: The folder cannot be created or read, or another command uses it.
+            OutputError: The folder cannot be created or read, another command uses it, or a stored document was
+                changed together with its checksum.
         """
         with parents_of(self.folder):
             self._make_folder()
             with used_alone(self.folder, self.folder), undone(self._remove_empty):
-                yield self
+                try:
+                    yield self
+                except _BROKEN as error:
+                    if not self._used:
+                        raise
+                    what = f"contains a run that was changed ({type(error).__name__}: {error})"
+                    raise OutputError(what, where=str(self.folder), hint="delete this folder") from error
 
     def _make_folder(self) -> None:
         try:
@@ -72,17 +81,23 @@ class JobStore:
 
     def find(self, job: Job) -> Document | None:
         """Return the document of a finished job, or ``None`` if a file is missing or damaged."""
+        path = self._path(job)
         try:
-            checksum, _, text = read_text(self._path(job)).partition("\n")
+            # Opening a pipe would block.
+            if not path.is_file():
+                return None
+            checksum, _, text = read_text(path).partition("\n")
             if checksum != _checksum(text.encode()):
                 return None
             stored = json.loads(text)
             for sign, checksum in stored["series"].items():
-                if checksum != _checksum(self.series(job, int(sign)).read_bytes()):
+                series = self.series(job, int(sign))
+                if not series.is_file() or checksum != _checksum(series.read_bytes()):
                     return None
-        except (OSError, UnicodeError):
+            document: Document = stored["document"]
+        except (OSError, *_BROKEN):
             return None
-        document: Document = stored["document"]
+        self._used = True
         return document
 
     def finished(self, job: Job) -> Document:
