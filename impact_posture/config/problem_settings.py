@@ -66,7 +66,7 @@ CLEARANCE, PATCH = 0.001, 0.3
 # Default friction coefficient (Coulomb).
 FRICTION = Unstated(0.7)
 # Default number of starts of a multi-start search, and most random postures that the adaptive search screens.
-STARTS, SCREENED = 16, 1536
+STARTS, SCREENED = 16, 6144
 # Number of bounds if --tradeoff is given without a number.
 TRADEOFF_POINTS = 16
 # Default approach speed (m/s), and default coefficient of restitution, of predicted impacts.

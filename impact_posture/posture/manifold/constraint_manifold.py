@@ -67,7 +67,7 @@ class ConstraintManifold:
 
     Coordinates are chart coordinates ``x`` and tangent vectors ``v``.  Postures that differ by full turns of joints
     are the same.  A joint whose range is at least a full turn therefore has no limit, and its entries of ``lower``
-    and ``upper``, shape (nx,), are infinite.
+    and ``upper``, shape (nx,), are infinite.  The equalities leave at least ``free`` degrees of freedom.
     """
 
     def __init__(self, problem: ConstrainedProblem) -> None:
@@ -84,6 +84,7 @@ class ConstraintManifold:
         equal = ca.vertcat(ca.SX(0, 1), *[c.symbolic(tree, ca.SX(ca.DM(c.parameters))) for c in equalities])
         self._inequalities = [c for c in problem.constraints if c not in equalities]
         jacobian = ca.vertcat(ca.jacobian(equal, x) @ motion, held)
+        self.free = self.chart.nv - jacobian.shape[0]
         rows = [ca.vertcat(equal, ca.SX(len(held), 1)), jacobian]
         self._equalities = BatchFunction([x], rows)
         objective = list(problem.impact.gradient_fun()(tree.q, ca.DM(problem.impact.contact.normal)))

@@ -26,9 +26,9 @@ from impact_posture.system.arrays import Array
 # Number of descents under way.  New descents begin when a quarter of them has ended.  When no more may begin, the
 # search does not wait for this share, because a small batch takes nearly as long as a large one.
 _WIDTH, _SLOWEST = 512, 1 / 16
-# The number of descents, times the third power of the degrees of freedom, is limited by the first number, because
+# The number of descents, times the fourth power of the degrees of freedom, is limited by the first number, because
 # descents of large robots take longer.  At least the second number is allowed.
-_WORK, _LEAST = 1_300_000, 16
+_WORK, _LEAST = 40_000_000, 16
 # Share of the new descents that are hops.
 _HOPPING = 0.75
 # A hop starts at an optimum with a probability proportional to ``(1 + rank)^-_RANKED / (1 + hops / _TIRED)²``.  The
@@ -39,9 +39,11 @@ _RANKED, _TIRED = 0.7, 8
 _REDRAWN, _CROSSED = (0.1, 0.2, 0.3, 0.5), 0.6
 # Distance (rad, m) below which two ends are the same optimum if their merits differ by less than SAME_VALUE.
 _SAME = 0.05
-# The search stops if random postures and hops from worse ends reached the best merit ``_HITS`` times, at least
-# ``_ENDS`` descents have ended, and the last ends, a share ``_IDLE`` of all, did not lower the best merit.
-_HITS, _ENDS, _IDLE = 12, 256, 0.5
+# The search stops if random postures and hops from worse ends reached the best merit often enough, at least ``_ENDS``
+# descents have ended, and the last ends, a share ``_IDLE`` of all, did not lower the best merit.  ``_HITS`` times are
+# enough if the equalities leave at most ``_FREE`` degrees of freedom.  Each further one doubles the times, because
+# the number of optima grows exponentially with the degrees of freedom.
+_HITS, _FREE, _ENDS, _IDLE = 12, 5, 256, 0.5
 # Number of starts of IPOPT, half of them at the best ends and half at the most different good ends.  If descents
 # ignored no constraint, a third suffices.  The number, times the degrees of freedom, is limited by the second
 # number, because a solution takes longer for large robots.
@@ -78,7 +80,7 @@ def screenable(problem: ConstrainedProblem) -> bool:
 def screen(problem: ConstrainedProblem, initial: Array, most: int, seed: int) -> Screening:
     """Screen at most ``most`` random postures and hops, some of them near the posture ``initial``, shape (nq,)."""
     search = _Search(problem, initial, seed)
-    most = min(most, max(_LEAST, _WORK // problem.robot.nv**3))
+    most = min(most, max(_LEAST, _WORK // problem.robot.nv**4))
     width, drawn = min(_WIDTH, most), 0
     while True:
         room = width - search.descent.active
@@ -139,7 +141,8 @@ class _Search:
             return False
         best = merit <= merit.min() + SAME_VALUE
         hits = int((best & ((tag == _RANDOM) | ~best[tag])).sum())
-        return hits >= _HITS and bool(best.argmax() < (1 - _IDLE) * len(merit))
+        enough = _HITS * 2 ** max(self._manifold.free - _FREE, 0)
+        return hits >= enough and bool(best.argmax() < (1 - _IDLE) * len(merit))
 
     def result(self) -> Screening:
         """Return the guesses and the hits of all ends."""
