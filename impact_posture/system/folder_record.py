@@ -104,9 +104,9 @@ def _foreign(folder: Path, ours: set[str], below: str = "") -> list[str]:
 
 def changed_files(folder: Path) -> list[str]:
     """Return the files that the record of a folder lists, but that were changed or replaced since then, sorted."""
-    content = read_record(folder)
-    names = [] if content is None else content["files"]
-    return [name for name in names if name != RECORD and (folder / name).exists() and not is_own(folder, name)]
+    known = {*(read_record(folder) or {"files": []})["files"]}
+    names = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir())
+    return [name for name in names if name in known and not is_own(folder, name)]
 
 
 def is_own(folder: Path, name: str, path: Path | None = None) -> bool:

@@ -28,7 +28,7 @@ from impact_posture.system.folder_record import (
     write_record,
 )
 from impact_posture.system.processes import signals_held, undone
-from impact_posture.system.scratch_folder import RECORD, SCRATCH, remove_scratch, scratch_folder
+from impact_posture.system.scratch_folder import RECORD, SCRATCH, remove_killed, remove_scratch, scratch_folder
 
 # Number of foreign files that a message names.
 _SHOWN = 3
@@ -225,6 +225,7 @@ def _check_ours(out: Path, kind: Kind) -> None:
     if content is not None and content["kind"] not in (kind, "pictures"):
         fault = f"holds another command's results ({content['kind']})"
         raise OutputError(fault, where=str(out), hint="choose another `out`")
+    remove_killed(out)
     foreign = foreign_files(out)
     if foreign:
         fault = f"holds {listed(foreign, _SHOWN)}, which this command did not write"

@@ -48,7 +48,7 @@ def scratch_folder(parent: Path | None = None, mode: int = 0o700) -> Iterator[Pa
         parent = Path(tempfile.gettempdir()) if parent is None else parent
     except FileNotFoundError:
         raise OutputError("no temporary folder can be written", where="TMPDIR", hint="set it to a folder") from None
-    _sweep(parent)
+    remove_killed(parent)
     folder = parent / f"{SCRATCH}{secrets.token_hex(4)}"
     # Make the folder inside this block, so that a signal removes the folder.
     with undone(lambda: remove_scratch(folder)):
@@ -70,7 +70,7 @@ def scratch_folder(parent: Path | None = None, mode: int = 0o700) -> Iterator[Pa
             os.close(record)
 
 
-def _sweep(parent: Path) -> None:
+def remove_killed(parent: Path) -> None:
     """Remove the temporary folders of killed processes in ``parent``."""
     with suppress(OSError):
         for folder in parent.glob(f"{SCRATCH}*"):

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import json
+import random
 import shutil
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from impact_posture.errors import OutputError
 from impact_posture.sweep.sweep_file import read_sweep
 from impact_posture.sweep.sweep_run import run_sweep
+from impact_posture.system.output_folder import added_files, check_output, whole_folder
+from impact_posture.system.scratch_folder import RECORD
 from impact_posture_cli.app import build
-from tests.hostile.arena import SMALL, strike
+from tests.hostile.arena import SMALL, judging, strike
+from tests.hostile.values import spoiled
 
 SWEEP = """
 [problem]
@@ -118,3 +124,45 @@ def test_a_sweep_replaces_another_sweep_by_force(press: Path, arena: Path) -> No
 @pytest.mark.parametrize("name", ["plot", "report", *{argv[0] for argv in WHOLE.values()}, "inspect"])
 def test_each_command_that_writes_has_force(name: str) -> None:
     assert any("--force" in option.opts for option in build(name).params)
+
+
+JSON_VALUES = (
+    "NaN", "[]", "null", '"a"', '["\\u0000"]', '["../../x"]', '["/dev/zero"]', '{"b.svg": 3}', '{"b.svg": null}',
+    '["."]', '[""]', "1e999", '["\\ud800"]', f'["{"x" * 300}"]', f'["{"a/" * 3000}"]',
+)  # fmt: skip
+
+
+def test_damaged_records_give_no_file_away(tmp_path: Path, hostile_full: bool) -> None:
+    rng, out = random.Random(0), tmp_path / "out"
+    with judging() as judge:
+        for k in range(1000 if hostile_full else 50):
+            shutil.rmtree(out, ignore_errors=True)
+            with whole_folder(out, force=False, kind="result") as folder:
+                (folder / "a.svg").write_text("old")
+            (out / "b.svg").write_text("mine")
+            text = (out / RECORD).read_text()
+            if k % 2:
+                content = json.loads(text)
+                content[rng.choice([*content])] = json.loads(rng.choice(JSON_VALUES))
+                (out / RECORD).write_text(json.dumps(content))
+            else:
+                (out / RECORD).write_bytes(spoiled(text, rng, JSON_VALUES))
+            faults = []
+            for use in (
+                lambda: check_output(out, force=False, kind="result"),
+                lambda: added(out, "b.svg"),
+                lambda: check_output(out, force=True, kind="result"),
+            ):
+                try:
+                    use()
+                    faults.append("is accepted")
+                except OutputError as error:
+                    faults += [] if "out" in error.where else [f"names no place: {error.line}"]
+                except Exception as error:
+                    faults.append(repr(error))
+            judge(f"record {k}", faults if (out / "b.svg").read_text() == "mine" else [*faults, "is lost"])
+
+
+def added(out: Path, name: str) -> None:
+    with added_files(out, force=False) as beside:
+        (beside / name).write_text("new")

@@ -373,6 +373,14 @@ with whole_folder(Path(sys.argv[1], "out"), force=False, kind="result") as folde
 """
 
 
+def test_a_folder_of_a_killed_command_in_a_result_is_not_foreign(tmp_path: Path) -> None:
+    write(tmp_path / "out", "one")
+    killed = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path / "out")], check=False, timeout=60)
+    assert killed.returncode == -signal.SIGKILL and len(list((tmp_path / "out").iterdir())) == 4
+    write(tmp_path / "out", "two", force=True)
+    assert content(tmp_path)["out/result.json"] == "two"
+
+
 def test_the_next_run_removes_only_the_folder_of_a_killed_run(tmp_path: Path) -> None:
     killed = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path)], check=False, timeout=60)
     assert killed.returncode == -signal.SIGKILL
