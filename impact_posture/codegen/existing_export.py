@@ -13,6 +13,7 @@ from impact_posture.codegen.manifest_builder import build_manifest
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.system.folder_record import own_files
 from impact_posture.system.libraries import library_path
+from impact_posture.system.text_files import read_text
 from impact_posture.system.toolchain import find_compiler
 
 # Keys of a manifest whose values depend on more than the objective.
@@ -34,7 +35,7 @@ def existing_export(objective: WorstCaseObjective, out: Path, *, build: bool) ->
     if f"{prefix}.json" not in files or not all((out / name).is_file() for name in files):
         return None
     try:
-        manifest = json.loads((out / f"{prefix}.json").read_text(encoding="utf-8"))
+        manifest = json.loads(read_text(out / f"{prefix}.json"))
         content = _comparable(manifest)
     except (OSError, LookupError, ValueError, TypeError, AttributeError, RecursionError):
         return None

@@ -9,13 +9,13 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from impact_posture.collision.mesh_file import UnusableShape, read_meshes
 from impact_posture.collision.mjcf_shapes import mjcf_shapes
 from impact_posture.collision.shape_corners import Corrected, shape_points
 from impact_posture.collision.shape_pairs import disabled_links, pairs_apart
 from impact_posture.collision.urdf_shapes import (
     LinkShape,
     LinkShapes,
-    UnusableShape,
     largest_extent,
     left_out,
     read_urdf_shapes,
@@ -51,6 +51,7 @@ def load_geometry(robot: Robot, described: list[LinkShape]) -> Geometry:
     """Load the shapes in a URDF; leave out unusable shapes with a warning."""
     model, largest = robot.model, largest_extent(robot)
     kept, solids, warnings = [], [], []
+    read_meshes(shape.mesh for shape in described if shape.mesh is not None)
     # Load a mesh that several limbs share only once, because loading may take a tenth of a second.
     loaded: dict[object, Corrected] = {}
     for shape in described:

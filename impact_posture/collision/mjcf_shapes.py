@@ -15,8 +15,9 @@ from typing import Any
 
 import numpy as np
 
+from impact_posture.collision.mesh_file import UnusableShape
 from impact_posture.collision.shape_corners import Corrected, Triangles, hull_surface, triangle_mesh
-from impact_posture.collision.urdf_shapes import LinkShape, LinkShapes, UnusableShape
+from impact_posture.collision.urdf_shapes import LinkShape, LinkShapes
 from impact_posture.robot.mjcf_file import is_floating, object_name
 from impact_posture.robot.mjcf_model import placement
 from impact_posture.system.arrays import Array

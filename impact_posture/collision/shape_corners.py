@@ -51,18 +51,6 @@ def hull_surface(points: Array) -> tuple[Array, Triangles]:
     return corners, SweptHull("", "", 0, corners, 0.0).faces.astype(int)
 
 
-def correct(shape: Any) -> Corrected:
-    """Return a coal mesh with the triangles in its file."""
-    points, faces = mesh_points(shape), mesh_triangles(shape)
-    triangles = renumbered(len(points), faces)
-    if triangles is faces:
-        return Corrected(shape, True)
-    exact = triangles is not None
-    if triangles is None:
-        points, triangles = hull_surface(points)
-    return Corrected(triangle_mesh(points, triangles), exact)
-
-
 def triangle_mesh(points: Array, triangles: Triangles) -> Any:
     """Return the coal mesh with these corners, shape (k, 3), m, and triangles, shape (n, 3)."""
     mesh = coal.BVHModelOBBRSS()

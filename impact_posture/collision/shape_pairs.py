@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator, Sequence
 
 import coal
@@ -12,9 +11,9 @@ from numpy.typing import NDArray
 
 from impact_posture.collision.mjcf_shapes import disabled_bodies
 from impact_posture.collision.swept_hull import SweptHull, separation, transform
-from impact_posture.errors import UrdfError
 from impact_posture.robot.model_joints import v_slice
 from impact_posture.robot.robot import Robot
+from impact_posture.robot.urdf import read_srdf
 from impact_posture.system.arrays import Array
 
 # Number of random postures in touching_by_design, and in nested_pairs.
@@ -135,8 +134,5 @@ def disabled_links(robot: Robot) -> set[frozenset[str]]:
     path = None if robot.files is None else robot.files.srdf
     if path is None:
         return pairs
-    try:
-        tags = ET.parse(path).getroot().iter("disable_collisions")
-    except (OSError, ET.ParseError) as error:
-        raise UrdfError(f"is not an SRDF ({error})", where=str(path), hint="correct the SRDF") from None
+    tags = read_srdf(path).iter("disable_collisions")
     return pairs | {frozenset((tag.get("link1", ""), tag.get("link2", ""))) for tag in tags}

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
-import re
 import xml.etree.ElementTree as ET
-import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -20,29 +16,23 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.collision.shape_corners import Corrected, correct, mesh_points, mesh_triangles, triangle_mesh
+from impact_posture.collision.mesh_file import (
+    LARGEST_FILE,
+    UnusableShape,
+    file_size,
+    read_mesh,
+    states_y_up,
+)
+from impact_posture.collision.shape_corners import Corrected, hull_surface, triangle_mesh
 from impact_posture.config.text_parsers import finite_numbers
 from impact_posture.errors import UrdfError, one_line
 from impact_posture.robot.robot import Robot, RobotFiles
-from impact_posture.robot.urdf import parse_urdf, quiet_stderr
-from impact_posture.system.arrays import Array
+from impact_posture.robot.urdf import parse_urdf
+from impact_posture.system.folder_record import sha256_of
 
 # A shape larger than 5 m and larger than ten times the robot is not in meters.
 _LARGEST = 5.0
 _LARGEST_SHARE = 10.0
-# Number of bytes at the start of a mesh file in which the up axis and the unit are searched.
-_HEAD = 10_000
-# The statement of the unit in each mesh format that can state a unit: in meters, or a name.
-_UNIT_TAGS = {
-    ".dae": rb"""<unit\b[^>]*?\bmeter\s*=\s*["']([^"']*)""",
-    ".x3d": rb"""<unit\b(?=[^>]*\bcategory\s*=\s*["']length["'])[^>]*?\bconversionFactor\s*=\s*["']([^"']*)""",
-    ".amf": rb"""<amf\b[^>]*?\bunit\s*=\s*["']([^"']*)""",
-    ".3mf": rb"""<model\b[^>]*?\bunit\s*=\s*["']([^"']*)""",
-}
-# The names of units in AMF and 3MF files, m.
-_UNITS = {"micron": 1e-6, "millimeter": 1e-3, "centimeter": 1e-2, "inch": 0.0254, "feet": 0.3048, "foot": 0.3048}
-# Largest mesh file, bytes, because loading a binary STL takes about 20 times its size in memory.
-_LARGEST_FILE = 100_000_000
 # Attributes with the sizes of each shape type, and the number of values in each attribute.
 _SIZES = {
     "box": {"size": 3},
@@ -80,10 +70,6 @@ class LinkShapes(NamedTuple):
                 self.warnings.append(left_out(name, fault))
 
 
-class UnusableShape(Exception):
-    """A shape cannot be used; the message contains the reason and a hint."""
-
-
 @dataclass(frozen=True)
 class LinkShape:
     """A shape of a link in a URDF or MJCF.
@@ -112,26 +98,12 @@ class LinkShape:
     @property
     def content(self) -> str:
         """Hash of the mesh file; empty without a mesh."""
-        if self.mesh is None:
-            return ""
-        with self.mesh.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
+        return "" if self.mesh is None else sha256_of(self.mesh)
 
     @cached_property
     def y_up(self) -> bool:
         """Whether the mesh is a COLLADA file which states that the y axis is up."""
-        return self.mesh is not None and self.mesh.suffix.lower() == ".dae" and b"<up_axis>Y_UP" in _head(self.mesh)
-
-    @cached_property
-    def unit(self) -> float:
-        """Unit of length that the mesh file states, m; 1 if it states none."""
-        tag = None if self.mesh is None else _UNIT_TAGS.get(self.mesh.suffix.lower())
-        stated = re.search(tag, _head(self.mesh)) if self.mesh and tag else None
-        text = "1" if stated is None else stated[1].decode("latin-1").strip().lower()
-        with suppress(ValueError):
-            unit = _UNITS.get(text) or float(text)
-            return unit if 0 < unit < float("inf") else 1.0
-        return 1.0
+        return self.mesh is not None and states_y_up(self.mesh)
 
     def load(self, largest: float) -> Corrected:
         """Return the coal shape, and whether it is exact or a convex hull; reject shapes larger than ``largest`` (m).
@@ -146,27 +118,19 @@ class LinkShape:
         return Corrected(getattr(coal, self.kind.capitalize())(*self.sizes), True)
 
     def _load_mesh(self, largest: float) -> Corrected:
-        try:
-            root, scale = _root_transform(self.mesh), self.unit * np.array(self.sizes)
-            with quiet_stderr():
-                # Use a new loader every time, because a loader keeps all meshes in memory.
-                shape = coal.MeshLoader().load(str(self.mesh), scale)
-            if root is not None:
-                moved = (mesh_points(shape) / scale) @ root[:3, :3].T + root[:3, 3]
-                shape = triangle_mesh(moved * scale, mesh_triangles(shape))
-        except Exception:  # The mesh library assimp may raise any exception.
-            raise UnusableShape(f"{self.mesh} cannot be read as a mesh, or is empty; export it again") from None
-        points = mesh_points(shape)
+        points, triangles, unit = read_mesh(self.mesh or Path())
+        points = points * (unit * np.array(self.sizes))
         if not np.isfinite(points).all():
             raise UnusableShape(f"{self.mesh} has vertices that are not finite; export it again")
         extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
         if extent <= 0:
             raise UnusableShape(f"{self.mesh} has no extent; export it again")
         if extent > largest:
-            stated = f" with the unit of {self.unit:g} m that it states" if self.unit != 1 else ""
+            stated = f" with the unit of {unit:g} m that it states" if unit != 1 else ""
             hint = 'give its <mesh> a scale, such as scale="0.001 0.001 0.001" for millimeters'
             raise UnusableShape(f"{self.mesh} is {extent:.3g} m large{stated}, so it is not in meters; {hint}")
-        return correct(shape)
+        surface = hull_surface(points) if triangles is None else (points, triangles)
+        return Corrected(triangle_mesh(*surface), triangles is not None)
 
 
 def largest_extent(robot: Robot) -> float:
@@ -198,52 +162,6 @@ def read_urdf_shapes(robot: Robot, first: str = "collision") -> LinkShapes:
         tags = link.findall(first) or link.findall("visual") or link.findall("collision")
         read.add(name, tags, partial(_read, link=name, files=files, colors=colors))
     return read
-
-
-def _size(mesh: Path) -> int:
-    """Return the number of bytes in a mesh file, or in the files of a 3MF archive."""
-    with suppress(zipfile.BadZipFile):
-        if mesh.suffix.lower() == ".3mf":
-            with zipfile.ZipFile(mesh) as archive:
-                return sum(file.file_size for file in archive.infolist())
-    return mesh.stat().st_size
-
-
-def _head(mesh: Path) -> bytes:
-    """Return the first bytes of a mesh file, or of the model inside a 3MF archive."""
-    if mesh.suffix.lower() == ".3mf":
-        with zipfile.ZipFile(mesh) as archive:
-            models = [name for name in archive.namelist() if name.endswith(".model")]
-            return archive.open(models[0]).read(_HEAD) if models else b""
-    with mesh.open("rb") as file:
-        return file.read(_HEAD)
-
-
-def _root_transform(mesh: Path | None) -> Array | None:
-    """Return the transform of the single root node of a glTF file, which coal leaves out, shape (4, 4).
-
-    Return ``None`` for other files, and for a root node that coal reads correctly.
-    """
-    if mesh is None or mesh.suffix.lower() not in (".gltf", ".glb"):
-        return None
-    data = mesh.read_bytes()
-    end = 20 + int.from_bytes(data[12:16], "little") if data.startswith(b"glTF") else 0
-    if end > len(data):  # The mesh library would allocate the stated length.
-        raise ValueError("the file ends too early")
-    content = json.loads(data[20:end] if end else data)
-    roots = [
-        content["nodes"][k] for scene in content["scenes"][content.get("scene", 0) :][:1] for k in scene["nodes"]
-    ]
-    root = roots[0] if len(roots) == 1 else {}
-    if "mesh" in root or not {"matrix", "rotation", "scale", "translation"} & root.keys():
-        return None
-    if "matrix" in root:
-        return np.array(root["matrix"], dtype=float).reshape(4, 4).T
-    transform = np.eye(4)
-    rotation = pin.Quaternion(np.array(root.get("rotation", [0.0, 0.0, 0.0, 1.0]), dtype=float)).normalized()
-    transform[:3, :3] = rotation.matrix() * root.get("scale", [1.0, 1.0, 1.0])
-    transform[:3, 3] = root.get("translation", [0.0, 0.0, 0.0])
-    return transform
 
 
 def left_out(name: str, fault: UnusableShape) -> str:
@@ -301,8 +219,8 @@ def _find_mesh(text: str, files: RobotFiles) -> Path:
         if path.is_file():
             if not os.access(path, os.R_OK):
                 raise UnusableShape(f"{path} cannot be read; change its permissions")
-            if _size(path) > _LARGEST_FILE:
-                raise UnusableShape(f"{path} is larger than {_LARGEST_FILE // 1_000_000} MB; simplify the mesh")
+            if file_size(path) > LARGEST_FILE:
+                raise UnusableShape(f"{path} is larger than {LARGEST_FILE // 1_000_000} MB; simplify the mesh")
             return path
     hint = "name the folder above the package with `package_dir`" if scheme == "package" else "correct the path"
     raise UnusableShape(f"no mesh '{text}'; {hint}")

@@ -16,11 +16,15 @@ from impact_posture.config.table_validation import adapter
 from impact_posture.errors import OutputError
 from impact_posture.system.libraries import cache_folder, check_private
 from impact_posture.system.output_folder import write_whole
+from impact_posture.system.text_files import read_text
 
 _Value = TypeVar("_Value", bound=Hashable)
 
 # Largest cache file that is read, bytes: three times the largest file for the robots of this package.
 _LONGEST = 10_000_000
+
+# For each running ``make``, whether its value may be stored.
+_STORABLE: list[bool] = []
 
 
 def _packed(array: NDArray[Any]) -> tuple[str, tuple[int, ...], str]:
@@ -46,15 +50,26 @@ def cached(kind: str, key: str, cls: type[_Value], make: Callable[[], _Value]) -
         path = cache_folder(kind) / f"{key}.json"
         check_private(path)
         if path.stat().st_size <= _LONGEST:
-            seal, text = path.read_text(encoding="utf-8").split("\n", 1)
+            seal, text = read_text(path).split("\n", 1)
             if seal == _seal(text):
                 stored: _Value = adapter(cls).validate_json(text)
                 return stored
-    value = make()
+    _STORABLE.append(True)
+    try:
+        value = make()
+    finally:
+        storable = _STORABLE.pop()
+    if not storable:
+        return value
     text = adapter(cls).dump_json(value).decode()
     with suppress(OSError, OutputError):
         write_whole(cache_folder(kind) / f"{key}.json", f"{_seal(text)}\n{text}")
     return value
+
+
+def do_not_store() -> None:
+    """Keep the values that are being made out of the cache, because another attempt may give other values."""
+    _STORABLE[:] = [False] * len(_STORABLE)
 
 
 def _seal(text: str) -> str:

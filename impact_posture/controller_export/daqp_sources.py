@@ -17,6 +17,7 @@ from pathlib import Path
 
 from impact_posture.errors import InputError
 from impact_posture.system.libraries import building, cache_folder, is_cached
+from impact_posture.system.text_files import read_bytes
 
 VERSION = "0.11.0"
 SOURCES = ("auxiliary.c", "daqp.c", "factorization.c")
@@ -104,7 +105,7 @@ def _from_folder(folder: Path, name: str) -> bytes | None:
     for path in (folder / FILES[name], folder / name):
         try:
             if path.is_file() and path.stat().st_size <= _LARGEST:
-                return path.read_bytes()
+                return read_bytes(path)
         except OSError as error:
             raise InputError.unreadable(path, error, _FOLDER_HINT) from None
     return None

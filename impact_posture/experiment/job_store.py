@@ -22,7 +22,7 @@ from impact_posture.simulation.scenario_file import scenario_path
 from impact_posture.system.libraries import source_key
 from impact_posture.system.output_folder import parents_of, used_alone, write_whole
 from impact_posture.system.processes import fork_map, undone
-from impact_posture.system.text_files import read_text
+from impact_posture.system.text_files import read_bytes, read_text
 
 Progress = Callable[[int, int], None]
 # Pattern of the names of stored files, and of incomplete files that a killed process leaves.
@@ -91,8 +91,7 @@ class JobStore:
                 return None
             stored = json.loads(text)
             for sign, checksum in stored["series"].items():
-                series = self.series(job, int(sign))
-                if not series.is_file() or checksum != _checksum(series.read_bytes()):
+                if checksum != _checksum(read_bytes(self.series(job, int(sign)))):
                     return None
             document: Document = stored["document"]
         except (OSError, *_BROKEN):
@@ -156,7 +155,7 @@ def _scenario(scenario: str) -> str:
     # A mesh that cannot be read has no effect on the results, so it is not part of the hash.
     with suppress(OSError):
         shapes = geometry_key(setup.robot, read_shapes(setup.robot)[0])
-    text = scenario_path(scenario).read_text(encoding="utf-8")
+    text = read_text(scenario_path(scenario))
     return "\0".join((text, setup.robot.data_sha256, repr(setup.q.tolist()), shapes))
 
 

@@ -13,6 +13,7 @@ from impact_posture.errors import InputError, SpecError, listed
 from impact_posture.robot.model_joints import is_free_flyer, joint_index, joint_range, v_slice
 from impact_posture.robot.robot_spec import RobotSpec
 from impact_posture.system.arrays import Array
+from impact_posture.system.text_files import read_bytes
 
 ArmatureOption = Mapping[str, float] | str | None
 
@@ -34,7 +35,7 @@ def set_armature(model: pin.Model, spec: RobotSpec, srdf: Path | None, option: A
         armature[:] = spec.armature.default or 0.0
         _set_joints(model, armature, spec.armature.joints, f"{name} [armature]")
         source = f"robot.toml ({spec.armature.source})" if spec.armature.source else "robot.toml"
-    elif srdf is not None and "rotor_params" in srdf.read_text(encoding="utf-8", errors="replace"):
+    elif srdf is not None and b"rotor_params" in read_bytes(srdf):
         pin.loadRotorParameters(model, str(srdf), False)
         armature = np.array(model.armature, dtype=float)
         source = "rotor data in the SRDF"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -15,6 +14,7 @@ from impact_posture.errors import PostureError
 from impact_posture.robot.model_joints import is_link, joint_range
 from impact_posture.robot.named_postures import states_with_base
 from impact_posture.robot.robot import Robot
+from impact_posture.robot.urdf import read_srdf
 
 # Common names of robot parts, collected from URDFs.
 _FOOT = re.compile(r"sole|foot|feet|hoof|paw|toe|ankle", re.I)
@@ -176,7 +176,7 @@ def srdf_near(urdf: Path) -> Path | None:
 
 def srdf_end_effectors(srdf: Path | None) -> Mapping[str, str]:
     """Return end-effector link → attribute values, as lower-case text, from the SRDF."""
-    tags = ET.parse(srdf).getroot().iter("end_effector") if srdf is not None else ()
+    tags = read_srdf(srdf).iter("end_effector") if srdf is not None else ()
     return {tag.get("parent_link", ""): " ".join(tag.attrib.values()).lower() for tag in tags}
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import re
 import warnings
 from collections.abc import Iterator
@@ -15,7 +16,9 @@ from impact_posture.errors import MjcfError, listed
 from impact_posture.robot.joint_coupling import JointCoupling, composed
 from impact_posture.robot.urdf import MOST_DEGREES_OF_FREEDOM
 from impact_posture.system.arrays import Array
+from impact_posture.system.isolated_calls import CallFailed, isolated_call
 from impact_posture.system.optional_package import import_mujoco, unwarned
+from impact_posture.system.text_files import open_regular, read_bytes
 
 # Value of the compiler option ``inertiafromgeom`` with which geoms replace stated inertias.
 _FROM_GEOMS = 1
@@ -29,6 +32,9 @@ _HEAD = 50_000
 # bodies, and four times as long for twice as many.  It crashes if a height field does not fit into memory.
 _MOST = 5_000
 _COUNT = re.compile(rb"""\b(?:nrow|ncol|count)\s*=\s*["']\s*(\d{1,9})""")
+# Processor time of the compiler, s.  It needs 2 s for 10,000 bodies.
+_SECONDS = 30.0
+_UTF_16 = codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE
 # Fields of a compiled model that have to be finite, and fields of ranges, which may be infinite.
 _NUMBERS = (
     "qpos0", "body_pos", "body_quat", "body_ipos", "body_iquat", "jnt_pos", "jnt_axis", "dof_armature", "site_pos",
@@ -58,10 +64,13 @@ class MjcfFile(NamedTuple):
 def is_mjcf(path: Path) -> bool:
     """Return whether the root of a file is ``<mujoco>`` or ``<mujocoinclude>``; ``False`` if it is unreadable."""
     try:
-        with path.open("rb") as file:
-            return _ROOT.match(file.read(_HEAD)) is not None
+        with open_regular(path) as file:
+            head = file.read(_HEAD)
     except (OSError, ValueError):
         return False
+    if head.startswith(_UTF_16):
+        head = head.decode("utf-16", errors="ignore").encode()
+    return _ROOT.match(head) is not None
 
 
 def read_mjcf(path: Path, root: Root | None) -> MjcfFile:
@@ -71,11 +80,22 @@ def read_mjcf(path: Path, root: Root | None) -> MjcfFile:
         MjcfError: MuJoCo rejects the file, or the file couples joints by loops, tendons or polynomials.
         InputError: MuJoCo is not installed.
     """
-    mujoco = import_mujoco()
-    text = path.read_bytes()
+    import_mujoco()
+    text = read_bytes(path)
+    if text.startswith(_UTF_16):
+        raise MjcfError("is in UTF-16, which MuJoCo cannot read", where=str(path), hint="save it as UTF-8")
     if max(text.count(b"<body"), *map(int, _COUNT.findall(text)), 0) > _MOST:
         fault = f"has more than {_MOST} bodies, repetitions, or rows or columns of a height field"
         raise MjcfError(fault, where=str(path), hint="name the file of the robot without its scene")
+    try:
+        return isolated_call(lambda: _read(path, root), _SECONDS)
+    except CallFailed as fault:
+        hint = "correct it and the files that it names"
+        raise MjcfError(fault.what, where=str(path), hint=hint) from None
+
+
+def _read(path: Path, root: Root | None) -> MjcfFile:
+    mujoco = import_mujoco()
     with unwarned(), warnings.catch_warnings(action="ignore"):
         try:
             spec = mujoco.MjSpec.from_file(str(path))

@@ -12,6 +12,7 @@ from impact_posture.errors import SpecError, UrdfError
 from impact_posture.robot.model_joints import is_free_flyer, joint_index, q_slice, scalar_entries
 from impact_posture.robot.robot_description import RobotDescription
 from impact_posture.robot.robot_spec import RobotSpec
+from impact_posture.robot.urdf import read_srdf
 from impact_posture.system.arrays import Array
 
 
@@ -40,7 +41,7 @@ def named_postures(
 
 def states_with_base(srdf: Path | None) -> list[str]:
     """Return the names of the ``group_state`` tags of an SRDF with a base pose (a joint with seven numbers)."""
-    states = ET.parse(srdf).getroot().iter("group_state") if srdf is not None else ()
+    states = read_srdf(srdf).iter("group_state") if srdf is not None else ()
     return [
         str(state.get("name"))
         for state in states
@@ -69,8 +70,9 @@ def _neutral(described: RobotDescription) -> Array:
 def _srdf_postures(model: pin.Model, srdf: Path | None) -> dict[str, Array]:
     if srdf is None:
         return {}
+    root = read_srdf(srdf)
     try:
-        pin.loadReferenceConfigurations(model, str(srdf), False)
+        pin.loadReferenceConfigurationsFromXML(model, ET.tostring(root, "unicode"), False)
     except Exception as error:  # The XML library of Pinocchio may raise any exception.
         raise UrdfError(f"is not an SRDF ({error})", where=str(srdf), hint="correct the SRDF") from None
     states = model.referenceConfigurations

@@ -20,6 +20,7 @@ from impact_posture.errors import PackageNotFound, SpecError, UrdfError
 from impact_posture.robot.inertia_checks import check_inertias
 from impact_posture.robot.joint_coupling import JointCoupling, urdf_couplings
 from impact_posture.robot.urdf_joints import clear_negative_limits, correct_joints
+from impact_posture.system.text_files import read_bytes
 
 # pin.Data always contains 6 nv³ numbers: 0.4 GB at 200 degrees of freedom, and 48 GB at 1,000.
 MOST_DEGREES_OF_FREEDOM = 200
@@ -176,6 +177,14 @@ def _read(path: Path) -> tuple[str, ET.Element]:
     return text, root
 
 
+def read_srdf(path: Path) -> ET.Element:
+    """Return the root element of an SRDF; raise ``UrdfError`` if the file cannot be read or is not XML."""
+    try:
+        return ET.fromstring(read_bytes(path))
+    except (OSError, ET.ParseError) as error:
+        raise UrdfError(f"is not an SRDF ({error})", where=str(path), hint="correct the SRDF") from None
+
+
 def _parse_xml(text: str) -> ET.Element:
     """Parse XML without namespaces and without the text between tags, which have no meaning in a URDF."""
     builder, parser = ET.TreeBuilder(), expat.ParserCreate()
@@ -186,7 +195,7 @@ def _parse_xml(text: str) -> ET.Element:
 
 def _xml_text(path: Path) -> str:
     """Return a file as text without comments; most files are in UTF-8, whatever encoding they declare."""
-    data = Path(path).read_bytes()
+    data = read_bytes(path)
     declared = re.match(rb"""\s*<\?xml[^>]*?encoding=["']([\w.:-]+)""", data)
     utf_16 = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     for encoding in ("utf-16" if utf_16 else "utf-8-sig", declared[1].decode() if declared else "", "latin-1"):

@@ -17,12 +17,15 @@ from types import ModuleType
 from urllib.parse import quote
 
 from impact_posture.errors import InputError, PackageNotFound, UrdfError, nearest
+from impact_posture.system.isolated_calls import CallFailed, isolated_call
 from impact_posture.system.libraries import cache_folder
 from impact_posture.system.optional_package import import_extra
 from impact_posture.system.output_folder import write_whole
 
 # Module of ROS from which xacro gets the folder of a package.
 _INDEX = "ament_index_python.packages"
+# Processor time to expand a file, s.  Expressions of the file can compute for hours.
+_SECONDS = 10.0
 
 
 class _Arguments(dict[str, str]):
@@ -97,7 +100,11 @@ def expand_xacro(
         InputError: xacro is not installed, or the file has no argument of this name.
     """
     values, index = _Arguments(arguments), _Packages(path, folders, packages)
-    root = _expanded(path, values, index)
+    try:
+        text, values.known = isolated_call(lambda: _expanded(path, values, index), _SECONDS)
+    except CallFailed as fault:
+        raise UrdfError(fault.what, where=str(path), hint="correct it and the files that it includes") from None
+    root = ET.fromstring(text)
     unknown = next((name for name in arguments if name not in values.known), None)
     if unknown is not None:
         close = nearest(unknown, values.known, 1)
@@ -116,11 +123,12 @@ def expand_xacro(
     return urdf
 
 
-def _expanded(path: Path, values: _Arguments, packages: _Packages) -> ET.Element:
+def _expanded(path: Path, values: _Arguments, packages: _Packages) -> tuple[str, set[str]]:
+    """Return the text of the URDF, and the names of the arguments that the file knows."""
     xacro = import_extra("xacro", "robots")
     try:
         with packages.indexed(), redirect_stderr(io.StringIO()):  # xacro prints the place of an error.
-            return ET.fromstring(xacro.process_file(str(path), mappings=values).toxml())
+            return xacro.process_file(str(path), mappings=values).toxml(), values.known
     except Exception as error:  # Expressions raise any error.
         cause = error
         while isinstance(cause, xacro.XacroException) and isinstance(cause.exc, Exception):

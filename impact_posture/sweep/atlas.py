@@ -19,6 +19,7 @@ from impact_posture.sweep.sweep_file import Sweep
 from impact_posture.sweep.sweep_manifest import MANIFEST, check_key, manifest_text, read_manifest
 from impact_posture.system.libraries import source_key
 from impact_posture.system.output_folder import used_alone, whole_folder, write_whole
+from impact_posture.system.text_files import open_regular, read_bytes
 
 if TYPE_CHECKING:
     from pyarrow.dataset import Dataset
@@ -80,7 +81,7 @@ class Atlas:
             other = True
         with ExitStack() as locks:
             locks.enter_context(used_alone(self.folder, manifest))
-            if manifest.read_bytes() != text.encode():
+            if read_bytes(manifest) != text.encode():
                 self.damaged.update([] if other else [MANIFEST])
                 write_whole(manifest, text)
                 # The lock of the old file does not hold for the new file.
@@ -144,7 +145,7 @@ class Atlas:
         """Return after how many passes a shard file was written, 0 if it cannot be used, and its content."""
         path, content, passes = self._path(shard, place), b"", 0
         with suppress(OSError):
-            content = path.read_bytes()
+            content = read_bytes(path)
             passes = passes_of(content, self._key, shard_name(self._sweep, shard))
         if not passes and os.path.lexists(path):
             self.damaged.add(path.relative_to(self.folder).as_posix())
@@ -184,8 +185,10 @@ def open_atlas(folder: str | Path) -> Dataset:
     pages = dataset.ParquetFragmentScanOptions(page_checksum_verification=True)
     partitions = dataset.FileSystemFactoryOptions(str(data), partitioning=dataset.HivePartitioning.discover())
     try:
-        names = {path.relative_to(data).as_posix(): path for path in paths} if manifest.has_checksums else {}
-        damaged = [name for name, path in names.items() if not passes_of(path.read_bytes(), manifest.key, name)]
+        for path in paths:
+            open_regular(path).close()
+        names = {path.relative_to(data).as_posix(): path for path in paths if manifest.has_checksums}
+        damaged = [name for name, path in names.items() if not passes_of(read_bytes(path), manifest.key, name)]
         if damaged:
             what, hint = f"has damaged shards ({listed(damaged)})", "run sweep again, which solves them again"
             raise SpecError(what, where=str(folder), hint=hint)

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from impact_posture.system.scratch_folder import RECORD, SCHEMA, made_by
-from impact_posture.system.text_files import read_text
+from impact_posture.system.text_files import open_regular, read_text
 
 Kind = Literal["result", "export", "run", "comparison", "reproduction", "sweep", "world", "pictures"]
 
@@ -49,7 +49,7 @@ def _with_files(content: dict[str, Any], folder: Path, paths: Iterable[Path]) ->
 
 def sha256_of(path: Path) -> str:
     """Return the SHA-256 of a file as hexadecimal digits."""
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 

@@ -23,6 +23,7 @@ from pathlib import Path
 from impact_posture.errors import CompilerError, OutputError, SpecError
 from impact_posture.system.folder_record import sha256_of
 from impact_posture.system.scratch_folder import scratch_folder
+from impact_posture.system.text_files import open_regular, read_bytes
 from impact_posture.system.toolchain import require_compiler, run_compiler, run_compilers, words_of
 from impact_posture.version import __version__
 
@@ -124,7 +125,7 @@ def hash_path(library: Path) -> Path:
 def has_its_hash(library: Path) -> bool | None:
     """Return whether a library matches the SHA-256 file beside it; ``None`` if the file is missing."""
     try:
-        words = hash_path(library).read_text(encoding="utf-8", errors="replace").split()
+        words = read_bytes(hash_path(library)).decode(errors="replace").split()
     except FileNotFoundError:
         return None
     return words[:1] == [sha256_of(library)]
@@ -138,7 +139,7 @@ def _check_sanitizer(library: Path) -> None:
     Raises:
         CompilerError: Loading the library ends the process.
     """
-    if not re.search(rb"san\.so|__[a-z]+san_", library.read_bytes()):
+    if not re.search(rb"san\.so|__[a-z]+san_", read_bytes(library)):
         return
     program = "import ctypes, sys; ctypes.CDLL(sys.argv[1])"
     trial = subprocess.run(
@@ -179,7 +180,7 @@ def _is_truncated(library: Path) -> bool:
 
     The system kills a process that loads a truncated file and reads a missing page (SIGBUS).
     """
-    with library.open("rb") as file:
+    with open_regular(library) as file:
         header = file.read(64)
     if len(header) < 64 or header[:5] != b"\x7fELF\2":
         return False

@@ -7,6 +7,8 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from impact_posture.system.text_files import open_regular
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -28,10 +30,10 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
     import numpy as np
 
     try:
-        file = np.load(path, allow_pickle=False)
-        if isinstance(file, np.ndarray):
-            raise ValueError(f"{path.name} holds an array without a name")
-        with file:
+        with open_regular(path) as stream:
+            file = np.load(stream, allow_pickle=False)
+            if isinstance(file, np.ndarray):
+                raise ValueError(f"{path.name} holds an array without a name")
             if sum(entry.file_size for entry in file.zip.infolist()) > MOST_BYTES:
                 raise OSError(errno.EFBIG, os.strerror(errno.EFBIG), str(path))
             arrays = {name: file[name] for name in file.files}

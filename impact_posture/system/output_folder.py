@@ -268,7 +268,7 @@ def used_alone(folder: Path, lock: Path) -> Iterator[None]:
     Raises:
         OutputError: Another command uses the folder.
     """
-    descriptor = os.open(lock, os.O_RDONLY)
+    descriptor = os.open(lock, os.O_RDONLY | os.O_NONBLOCK)
     try:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager, suppress
 from multiprocessing.process import BaseProcess
-from typing import Any, NoReturn, TypeVar, cast
+from typing import Any, Generic, NoReturn, TypeVar, cast
 
 from impact_posture.errors import WorkerDied
 
@@ -144,6 +144,28 @@ def _finished(futures: list[Future[tuple[int, _Result]]]) -> Iterator[tuple[int,
         raise WorkerDied() from None
 
 
+class Copy(Generic[_Result]):
+    """A copy of this process that sends results.
+
+    Attributes:
+        process: The process.
+        receiver: Pipe through which the results come.
+    """
+
+    def __init__(self, process: BaseProcess, receiver: Any) -> None:
+        self.process, self.receiver = process, receiver
+
+    def receive(self) -> _Result:
+        """Wait for the next result; raise the error of the copy, or ``WorkerDied`` if the copy was killed."""
+        try:
+            error, result = self.receiver.recv()
+        except (EOFError, ConnectionResetError):
+            raise WorkerDied() from None
+        if error is not None:
+            raise error
+        return cast(_Result, result)
+
+
 @contextmanager
 def fork_call(function: Callable[[], _Result]) -> Iterator[Callable[[], _Result]]:
     """Start ``function()`` in a copy of this process and yield a function that waits for its result.
@@ -157,30 +179,26 @@ def fork_call(function: Callable[[], _Result]) -> Iterator[Callable[[], _Result]
     """
     if not hasattr(os, "fork"):
         raise OSError("the system cannot fork")
+    with fork_stream(lambda: iter([function()])) as copy:
+        yield copy.receive
+
+
+@contextmanager
+def fork_stream(results: Callable[[], Iterator[_Result]]) -> Iterator[Copy[_Result]]:
+    """Start a copy of this process that sends each of ``results()``; the copy ends with the block."""
     receiver, sender = multiprocessing.Pipe(duplex=False)
-    copy = multiprocessing.get_context("fork").Process(target=_copy, args=(function, receiver, sender, os.getpid()))
-    with signals_held():
-        copy.start()
-    sender.close()
-
-    def collect() -> _Result:
+    copy = multiprocessing.get_context("fork").Process(target=_copy, args=(results, receiver, sender, os.getpid()))
+    with receiver:
+        with sender, signals_held():
+            copy.start()
         try:
-            error, result = receiver.recv()
-        except (EOFError, ConnectionResetError):
-            raise WorkerDied() from None
-        if error is not None:
-            raise error
-        return cast(_Result, result)
-
-    try:
-        with receiver:
-            yield collect
-    finally:
-        _end([copy])
+            yield Copy(copy, receiver)
+        finally:
+            _end([copy])
 
 
-def _copy(function: Callable[[], Any], receiver: Any, sender: Any, parent: int) -> NoReturn:
-    """Send the result or the error of ``function`` to the parent process, and end the process without clean-up."""
+def _copy(results: Callable[[], Iterator[Any]], receiver: Any, sender: Any, parent: int) -> NoReturn:
+    """Send the results, or the error that ends them, to the parent process; end the process without clean-up."""
     receiver.close()
     depend(parent)
     # With SIGTERM, the copy removes its temporary folders before it ends.
@@ -188,7 +206,8 @@ def _copy(function: Callable[[], Any], receiver: Any, sender: Any, parent: int) 
     signal.signal(signal.SIGTERM, lambda *_: end_early(lambda: os._exit(1)))
     try:
         try:
-            sender.send((None, function()))
+            for result in results():
+                sender.send((None, result))
         except BaseException as error:
             sender.send((error, None))
     finally:

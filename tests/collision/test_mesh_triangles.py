@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from impact_posture.collision.coal_geometry import load_geometry
 from impact_posture.collision.mesh_check import MeshCheck
-from impact_posture.collision.shape_corners import Corrected, mesh_points, mesh_triangles, renumbered
+from impact_posture.collision.shape_corners import mesh_points, mesh_triangles, renumbered
 from impact_posture.collision.swept_hull import obstacle_hull
 from impact_posture.collision.urdf_shapes import read_urdf_shapes
 from impact_posture.config.obstacle import Obstacle
@@ -54,7 +54,8 @@ def collada(path: Path) -> Path:
 
 
 def as_coal_reads_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("impact_posture.collision.urdf_shapes.correct", lambda shape: Corrected(shape, True))
+    monkeypatch.setattr("impact_posture.collision.mesh_file.renumbered", lambda count, faces: faces)
+    monkeypatch.setattr("impact_posture.collision.mesh_file._READ", {})
 
 
 @pytest.mark.parametrize("right", [True, False])
@@ -123,7 +124,7 @@ def test_parts_of_a_file_are_separated(nodes: list[list[int]]) -> None:
 
 
 def test_the_hull_replaces_parts_that_cannot_be_separated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("impact_posture.collision.shape_corners.renumbered", lambda *_: None)
+    monkeypatch.setattr("impact_posture.collision.mesh_file.renumbered", lambda *_: None)
     collada(tmp_path / "cubes.dae")
     shapes = arm(tmp_path, mesh("cubes.dae"))
     (line,) = shapes.warnings

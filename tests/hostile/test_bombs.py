@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import resource
 from pathlib import Path
 
 import pytest
 
+from impact_posture.system.text_files import MOST_CHARACTERS
 from tests.hostile.arena import strike
 
 PUSH = ("small.urdf", "--frame", "tip", "--normal", "0", "0", "1")
@@ -65,9 +67,10 @@ def test_files_that_grow(name: str, arena: Path) -> None:
     assert len(outcome.err) < 1_500
 
 
-@pytest.mark.skipif(not Path("/dev/zero").exists(), reason="no /dev/zero")
-def test_a_file_without_end(arena: Path) -> None:
-    outcome = strike(arena, "inspect", "small.urdf", "--config", "/dev/zero")
+def test_a_huge_file(arena: Path) -> None:
+    (arena / "r.toml").touch()
+    os.truncate(arena / "r.toml", MOST_CHARACTERS + 1)
+    outcome = strike(arena, "inspect", "small.urdf", "--config", "r.toml")
     assert (outcome.code, outcome.complaints) == (1, [])
     assert "File too large" in outcome.err
 

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import json
+import os
 import random
 import re
 import shutil
@@ -84,6 +85,16 @@ def test_results_of_another_version(key: str, value: object, words: str, result:
         outcome = strike(arena, *command)
         assert (outcome.code, outcome.complaints) == (1, []), outcome.err
         assert words in outcome.err and len(outcome.err) < 500
+
+
+@pytest.mark.parametrize("file", ["problem.toml", "result.json", "result.npz"])
+def test_pipes_in_a_result(file: str, result: Path, arena: Path) -> None:
+    shutil.copytree(result, arena / "out")
+    (arena / "out" / file).unlink()
+    os.mkfifo(arena / "out" / file)
+    for command in (("plot", "out"), ("report", "out"), ("codegen", "out", *STOP), ("verify", "out")):
+        outcome = strike(arena, *command)
+        assert (outcome.code, outcome.complaints) == (1, []), (command, outcome.err)
 
 
 def spoil_problem(folder: Path, rng: random.Random) -> None:

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import json
+import os
 import random
 import shutil
 from collections.abc import Callable
@@ -213,3 +214,15 @@ def test_folders_without_checksums_are_still_read(solved: tuple[Sweep, str, Path
     for shard in shards(tmp_path / "out"):
         shard.write_bytes(rewrite(shard.read_bytes(), lambda table: table.replace_schema_metadata({"sweep": "key"})))
     assert ip.sweep.open(tmp_path / "out").count_rows() == 8
+
+
+def test_a_pipe_in_the_place_of_a_shard(solved: tuple[Sweep, str, Path], tmp_path: Path) -> None:
+    sweep, _, folder = solved
+    shutil.copytree(folder, tmp_path / "out")
+    path = shards(tmp_path / "out")[1]
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(SpecError, match="pipe or a device"):
+        ip.sweep.open(tmp_path / "out")
+    run_sweep(sweep, tmp_path / "out")
+    assert contents(tmp_path / "out") == contents(folder)

@@ -23,6 +23,7 @@ from impact_posture.robot.robot import Robot
 from impact_posture.robot.urdf import example_robot_data
 from impact_posture.system.arrays import Array
 from impact_posture.system.libraries import source_key
+from impact_posture.system.text_files import open_regular
 
 # Maximum number of triangles of all meshes on a page.  This maximum limits the size of the page, and the time to draw
 # the robot without a GPU.
@@ -224,7 +225,7 @@ def _color(shape: LinkShape) -> Color:
     """Return the color in the URDF, or the mean color in a COLLADA file (coal does not read colors), or gray."""
     *color, opacity = shape.color or _GRAY
     if shape.color is None and shape.mesh is not None and shape.mesh.suffix.lower() == ".dae":
-        with shape.mesh.open("rb") as file:
+        with open_regular(shape.mesh) as file:
             head = file.read(_HEAD)
         colors = re.findall(rb"<diffuse>\s*<color[^>]*>\s*([\d.eE+-]+)\s+([\d.eE+-]+)\s+([\d.eE+-]+)\s", head)
         color = np.mean([[float(v) for v in values] for values in colors] or [color], axis=0).tolist()

@@ -19,6 +19,7 @@ from impact_posture.output.plot.result_view import number
 from impact_posture.output.report import REPORT
 from impact_posture.output.report.report_scene import ReportScene, Track, zipped
 from impact_posture.system.output_folder import added_files, write_whole
+from impact_posture.system.text_files import read_bytes
 from impact_posture.version import __version__
 
 _VIEWER = Path(__file__).parent / "viewer"
@@ -105,7 +106,7 @@ def figures(folder: Path) -> list[tuple[str, str]]:
     # In the sorted list, an SVG file follows the PNG file with the same name and replaces it.
     by_name = {str(path.relative_to(folder).with_suffix("")): path for path in paths}
     return [
-        (name, f"data:{_TYPES[path.suffix]};base64,{base64.b64encode(path.read_bytes()).decode('ascii')}")
+        (name, f"data:{_TYPES[path.suffix]};base64,{base64.b64encode(read_bytes(path)).decode('ascii')}")
         for name, path in by_name.items()
     ]
 

@@ -23,6 +23,7 @@ from impact_posture.posture.formulation.problem_file import Prepared
 from impact_posture.system.arrays import Array
 from impact_posture.system.folder_record import typed_command
 from impact_posture.system.scratch_folder import scratch_folder
+from impact_posture.system.text_files import read_text
 
 # Maximum number of frames of a motion over time.
 _MOST = 121
@@ -167,7 +168,7 @@ def _content(folder: Path, prepared: Prepared, view: ResultView, document: dict[
             f"{document['redundancy']} degrees of freedom are left by the constraints at the optimum.",
             *document["constraints"], *active, *document["notes"], *document["warnings"],
         ),
-        sources=(("problem.toml", (folder / "problem.toml").read_text(encoding="utf-8")),),
+        sources=(("problem.toml", read_text(folder / "problem.toml")),),
     )  # fmt: skip
 
 

@@ -11,8 +11,9 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.collision.coal_geometry import read_shapes
+from impact_posture.collision.mesh_file import UnusableShape
 from impact_posture.collision.shape_corners import shape_points
-from impact_posture.collision.urdf_shapes import UnusableShape, largest_extent
+from impact_posture.collision.urdf_shapes import largest_extent
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.mjcf import WORLD, Mjcf, build_mjcf
 from impact_posture.dynamics.numeric import Numeric

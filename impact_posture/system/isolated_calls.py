@@ -1,0 +1,149 @@
+"""Call C++ libraries in a copy of this process, because a damaged file may crash them, or occupy them for hours."""
+
+from __future__ import annotations
+
+import faulthandler
+import multiprocessing
+import os
+import resource
+import signal
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, Generic, NamedTuple, TypeVar
+
+from impact_posture.errors import ImpactPostureError, WorkerDied
+from impact_posture.system.processes import Copy, fork_stream
+
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
+
+# Memory that the calls may allocate, bytes: 1.5 times the memory for the largest mesh file.
+MOST_MEMORY = 3 << 30
+# A call that sleeps for this time, s, waits for a pipe or a device.  The copy of the process reads only local files.
+_LONGEST_SLEEP = 2.0
+_TOO_LARGE = "takes too much memory to read"
+# Time between two looks at a call, s.
+_PAUSE = 0.2
+
+
+class CallFailed(ImpactPostureError):
+    """A call crashed or exceeded a limit.  A repetition may succeed, for example on a faster machine."""
+
+
+class _Outcome(NamedTuple, Generic[_Result]):
+    """Result or exception of a call, and whether the copy should not make another call, for lack of memory."""
+
+    result: _Result | Exception
+    last: bool
+
+
+def isolated_calls(
+    function: Callable[[_Item], _Result], items: Sequence[_Item], seconds: Callable[[_Item], float]
+) -> Iterator[_Result | Exception]:
+    """Yield ``function(item)`` for each item, or the exception of the call.
+
+    The calls run one after the other in a copy of this process.  If a call ends the copy, a new copy continues with
+    the next item.  A call may use ``seconds(item)`` of processor time, and all calls :data:`MOST_MEMORY`.  The
+    signal handlers of this process run while a call waits for a file.
+
+    Raises:
+        ImpactPostureError: The system cannot start a process.
+    """
+    if multiprocessing.current_process().daemon:  # Such a process, for example of a cluster, must not start others.
+        yield from (_result(function, item) for item in items)
+        return
+
+    def outcomes() -> Iterator[_Outcome[_Result]]:
+        faulthandler.disable()  # This process reports a crash of the copy.
+        _limit(resource.RLIMIT_CORE, 0)
+        if before := _memory():
+            _limit(resource.RLIMIT_AS, before + MOST_MEMORY)
+        for item in items[done:]:
+            used = os.times()
+            # The limit is in whole seconds.
+            _limit(resource.RLIMIT_CPU, int(used.user + used.system + seconds(item)) + 1)
+            result = _result(function, item)
+            yield _Outcome(result, _memory() > before + MOST_MEMORY // 4)
+
+    done = 0
+    while done < len(items):
+        try:
+            with fork_stream(outcomes) as copy:
+                for item in items[done:]:
+                    done += 1
+                    outcome = _received(copy, seconds(item))
+                    yield outcome.result
+                    if outcome.last:
+                        break
+        except OSError as error:
+            hint = "end other processes, or raise the limits (ulimit -u, ulimit -n)"
+            raise ImpactPostureError(f"no process can be started ({error.strerror})", hint=hint) from None
+
+
+def isolated_call(function: Callable[[], _Result], seconds: float) -> _Result:
+    """Return ``function()``, called in a copy of this process with the limits of :func:`isolated_calls`.
+
+    Raises:
+        CallFailed: The call crashed or exceeded a limit.
+    """
+    (outcome,) = isolated_calls(lambda _: function(), [None], lambda _: seconds)
+    if isinstance(outcome, Exception):
+        raise outcome
+    return outcome
+
+
+def _result(function: Callable[[_Item], _Result], item: _Item) -> _Result | Exception:
+    try:
+        return function(item)
+    except Exception as error:
+        return error
+
+
+def _received(copy: Copy[_Outcome[_Result]], seconds: float) -> _Outcome[_Result]:
+    """Return the next outcome of a copy, or a :class:`CallFailed` if it sends none."""
+    used, since = -1, time.monotonic()
+    while not copy.receiver.poll(_PAUSE):
+        sleeps, now = _activity(copy.process.pid)
+        if not sleeps or now != used:
+            used, since = now, time.monotonic()
+        elif time.monotonic() > since + _LONGEST_SLEEP:
+            copy.process.kill()
+            return _failed("names a pipe or a device, which is not read")
+    try:
+        outcome = copy.receive()
+        return _failed(_TOO_LARGE) if isinstance(outcome.result, MemoryError) else outcome
+    except MemoryError:  # The copy could not send its result.
+        return _failed(_TOO_LARGE)
+    except WorkerDied:
+        copy.process.join()
+    if copy.process.exitcode == -signal.SIGXCPU:
+        return _failed(f"takes more than {seconds:.0f} s to read")
+    return _failed(_TOO_LARGE if copy.process.exitcode == -signal.SIGKILL else "crashes its reader")
+
+
+def _failed(why: str) -> _Outcome[Any]:
+    return _Outcome(CallFailed(why), True)
+
+
+def _activity(pid: int | None) -> tuple[bool, int]:
+    """Return whether a process sleeps, and its processor time in clock ticks; ``(False, 0)`` on other than Linux."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
+    except OSError:
+        return False, 0
+    return fields[0] == "S", int(fields[11]) + int(fields[12])
+
+
+def _memory() -> int:
+    """Return the address space of this process, bytes; 0 on other systems than Linux, which do not limit it."""
+    try:
+        return int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[0]) * resource.getpagesize()
+    except OSError:
+        return 0
+
+
+def _limit(kind: int, value: int) -> None:
+    """Set a limit of this process, at most to the limit that the user has set."""
+    most = resource.getrlimit(kind)[1]
+    resource.setrlimit(kind, (value if most == resource.RLIM_INFINITY else min(value, most), most))
