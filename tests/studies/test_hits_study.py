@@ -18,7 +18,7 @@ from docs.studies.hits.arm import MASSES, MODELS, URDF, Arm, with_box
 from docs.studies.hits.figure import PICTURE, figure
 from docs.studies.hits.fit import Fit, summary
 from docs.studies.hits.recordings import PERIOD, SOURCE, Group, Hit, by_group, contact_row, read_hits
-from docs.studies.hits.study import AT_TIP, FITTED, PER_BOX, REPEAT, TIP, Evaluation, lines
+from docs.studies.hits.study import AT_TIP, FITTED, LINKS, PER_BOX, REPEAT, Evaluation, lines
 from impact_posture.errors import InputError
 from tests.support.helpers import Vector, assert_close, rng
 
@@ -154,7 +154,7 @@ def test_the_true_model_predicts_the_other_groups(evaluation: Evaluation) -> Non
         score = evaluation.scores[group, "reflected"]
         assert score.error < 0.01 and score.cosine > 0.9999
         assert score.loss == pytest.approx(1, abs=0.01) and score.size == pytest.approx(1, abs=0.01)
-        assert all(evaluation.scores[group, name].error > 0.2 for name in (TIP, AT_TIP, "link"))
+        assert all(evaluation.scores[group, name].error > 0.2 for name in (LINKS, AT_TIP, "link"))
         assert (evaluation.scores[group, REPEAT].error < 1e-9) == (group == FITTED)
         assert ((group, PER_BOX) in evaluation.scores) == (group.posture == 2)
         from_torques, predicted, mass = evaluation.impulses(group)
@@ -240,6 +240,11 @@ def damaged(path: Path) -> Iterator[tuple[str, str]]:
         yield "without source", json.dumps({key: window[key] for key in ("contact_row_approx", "rows")})
         yield "without a contact", json.dumps({key: window[key] for key in ("source", "rows")})
         rows = [dict(row) for row in window["rows"]]
+        yield "a contact that is text", json.dumps(window | {"contact_row_approx": "soon"})
+        yield (
+            "times that are text",
+            json.dumps(window | {"rows": [dict(row) | {"t": "now"} for row in window["rows"]]}),
+        )
         yield "short rows", json.dumps(window | {"rows": [row | {"q": row["q"][:6]} for row in rows]})
         yield "not finite", json.dumps(window | {"rows": [*rows[:-1], rows[-1] | {"tau": [float("nan")] * 7}]})
     yield "not text", "\0\1"
@@ -269,7 +274,7 @@ def test_hits_that_cannot_be_used_are_left_out_with_the_reason(tmp_path: Path) -
     write_window(tmp_path, "hit_1", FITTED, repeated)
     write_window(tmp_path, "hit_2", FITTED, skipped)
     window = json.loads(good.read_text(encoding="utf-8"))
-    changes = {"hit_3": {"source": "D3/IIWA_7_hit_3.csv"}, "hit_4": {"contact_row_approx": 1}}
+    changes = {"hit_3": {"source": "config_1-object_2/D3/IIWA_7_hit_3.csv"}, "hit_4": {"contact_row_approx": 1}}
     changes |= {"hit_5": {"contact_row_approx": None}, "hit_6": {"contact_row_approx": ROWS - 5}}
     for name, change in changes.items():
         (tmp_path / f"{name}.json").write_text(json.dumps(window | change), encoding="utf-8")

@@ -27,7 +27,7 @@ class Summary:
     Attributes:
         q: Posture at the contact, rad, shape (7,).
         before: Joint velocities in the last row before the contact, rad/s, shape (7,).
-        jump: Joint jumps relative to the trend, without the share of the controller, rad/s, shape (7,).
+        jump: Joint jumps relative to the trend, without the effect of the controller, rad/s, shape (7,).
         relative: Joint jumps relative to the trend.
         recorded: Joint jumps as recorded.
         torque: Impulse of the measured joint torques, N·m·s, shape (7,).
@@ -58,7 +58,7 @@ def summary(hits: Sequence[Hit], arm: Arm) -> Summary:
 
 
 def as_recorded(measured: Summary) -> Summary:
-    """Return the summary with the jumps as recorded, with the shares of trend and controller."""
+    """Return the summary with the jumps as recorded, with the effects of trend and controller."""
     return replace(measured, jump=measured.recorded)
 
 
@@ -130,11 +130,10 @@ class Fitted:
     arm: Arm
     gain: float
 
-    def jump(self, measured: Summary, box: float | None = None) -> Vector:
+    def jump(self, measured: Summary) -> Vector:
         """Predict the joint jumps of a group, rad/s, shape (7,), from its posture and velocity before the contact."""
         speed = float(self.arm.approach(measured.q) @ measured.before)
-        mass = MASSES[measured.group.box] if box is None else box
-        return self.gain * speed * self.model.jump(self.arm, mass, measured.q)
+        return self.gain * speed * self.model.jump(self.arm, MASSES[measured.group.box], measured.q)
 
 
 def fit_contact(model: Model, arm: Arm, measured: Summary, *, at_tip: bool = False) -> Fitted:

@@ -7,7 +7,7 @@ import json
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -156,12 +156,12 @@ def _read(path: Path) -> Hit | str:
             source, contact, times, rows = _from_csv(path)
         else:
             source, contact, times, rows = _from_window(path)
-    except (KeyError, TypeError, ValueError, StopIteration) as error:
+    except (KeyError, TypeError, ValueError, StopIteration, csv.Error) as error:
         what = f"is not a recording of a hit ({type(error).__name__}: {error})"
         raise InputError(what, where=str(path), hint="download the file again") from None
     except OSError as error:
         raise InputError.unreadable(path, error) from None
-    named = re.search(r"config_(\d).*object_(\d)", source)
+    named = re.search(r"config_([12]).*object_([12])", PurePosixPath(source).parent.name)
     if named is None:
         return "neither posture 1 nor posture 2"
     group = Group(int(named[1]), int(named[2]))
@@ -180,8 +180,9 @@ def _read(path: Path) -> Hit | str:
 def _from_window(path: Path) -> tuple[str, int | None, Vector, dict[str, Vector]]:
     window = json.loads(path.read_text(encoding="utf-8"))
     contact = window["contact_row_approx"] if "contact_row_approx" in window else window["impact_row"]
+    contact = None if contact is None else int(contact)
     rows = _arrays({name: [row[key] for row in window["rows"]] for name, (_, key, _) in _QUANTITIES.items()})
-    return window["source"], contact, np.array([row["t"] for row in window["rows"]], dtype=float), rows
+    return str(window["source"]), contact, _times([row["t"] for row in window["rows"]]), rows
 
 
 def _from_csv(path: Path) -> tuple[str, int | None, Vector, dict[str, Vector]]:
@@ -190,7 +191,7 @@ def _from_csv(path: Path) -> tuple[str, int | None, Vector, dict[str, Vector]]:
         names = next(row for row in table if row and row[0] == "RobotName")
         rows = [dict(zip(names, row, strict=True)) for row in table]
     arrays = _arrays({name: [row[column].split() for row in rows] for name, (column, _, _) in _QUANTITIES.items()})
-    times = np.array([row["RosTime"] for row in rows], dtype=float)
+    times = _times([row["RosTime"] for row in rows])
     contact = contact_row(arrays["effort"], arrays["command"])
     if contact is None:
         return path.as_posix(), None, times, arrays
@@ -207,13 +208,20 @@ def _arrays(lists: Mapping[str, Iterable[Any]]) -> dict[str, Vector]:
     return arrays
 
 
+def _times(values: Iterable[Any]) -> Vector:
+    times = np.array(list(values), dtype=float)
+    if times.ndim != 1 or not np.isfinite(times).all():
+        raise ValueError("each row must have a finite time")
+    return times
+
+
 def contact_row(effort: Vector, command: Vector) -> int | None:
     """Return the first row in which the contact shows; ``None`` if no row does.
 
     Some 45 to 60 ms after the contact, the controller brakes, and its torque on joint 1 falls at once.  In the 70 ms
-    before this, the contact is the first row in which the effort of a joint changes by 4 N·m, and by 5 N·m within two
-    rows.  Joint 2 does not count, because its large effort is noisy.  In the 24 windows with
-    braking, the row differs by at most one from the row that their authors state.
+    before the braking, the contact is the first row in which the effort of a joint changes by 4 N·m, and by 5 N·m
+    within two rows.  Joint 2 does not count, because its large effort is noisy.  In the 24 windows with braking, the
+    row differs by at most one from the row that their authors state.
     """
     if len(effort) < _BRAKED:
         return None

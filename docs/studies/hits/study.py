@@ -22,14 +22,10 @@ from impact_posture.impact.worst_case_objective import WorstCaseObjective
 
 # All fits use this group.  The other groups are only predicted.
 FITTED = Group(1, 2)
-TIP, MASS, REPEAT, PER_BOX = (
-    "links at the tip",
-    "effective mass",
-    "repeat the fitted group",
-    "reflected, point per box",
-)
-AT_TIP = "reflected at the tip"
-PREDICTIONS = (TIP, MASS, REPEAT, AT_TIP, *MODELS, PER_BOX)
+# Names of the naive predictions, and of predictions with another contact point.
+LINKS, MASS, REPEAT = "links at the tip", "effective mass", "repeat the fitted group"
+AT_TIP, PER_BOX = "reflected at the tip", "reflected, point per box"
+PREDICTIONS = (LINKS, MASS, REPEAT, AT_TIP, *MODELS, PER_BOX)
 Groups = Mapping[Group, Sequence[Hit]]
 
 
@@ -65,7 +61,7 @@ class Evaluation:
 
     Args:
         groups: Hits by group, with :data:`FITTED`.
-        recorded: Whether to use the jumps as recorded, with the shares of trend and controller.
+        recorded: Whether to use the jumps as recorded, with the effects of trend and controller.
     """
 
     def __init__(self, groups: Groups, *, recorded: bool = False) -> None:
@@ -87,7 +83,7 @@ class Evaluation:
         """Return the predicted joint jumps of a group, rad/s, by prediction."""
         measured = self.measured[group]
         rate = _speed(measured) / _speed(self.fit.measured)
-        jumps = {TIP: Fitted(Model("link"), Arm(), 1.0).jump(measured), REPEAT: rate * self.fit.measured.jump}
+        jumps = {LINKS: Fitted(Model("link"), Arm(), 1.0).jump(measured), REPEAT: rate * self.fit.measured.jump}
         jumps |= {AT_TIP: self.at_tip.jump(measured)}
         jumps |= {name: fitted.jump(measured) for name, fitted in self.fit.models.items()}
         first = self.refits.get(Group(1, group.box))
@@ -109,9 +105,9 @@ class Evaluation:
     def impulses(self, group: Group) -> tuple[float, float, float]:
         """Return the impulse along the tool axis from the joint torques, as predicted by ``reflected``, and a mass.
 
-        The measured torques and the momentum of the links determine the impulse without rotors, controller and mass
-        of the box: ``M Δq̇ − ∫Δτ dt = −(j p + moments)``.  For a box of the returned mass, kg, ``reflected`` predicts
-        this impulse.  Impulses are in N·s.
+        The measured torques and the momentum of the links determine the impulse without controller, restitution and
+        mass of the box: ``M Δq̇ − ∫Δτ dt = −(j p + moments)``.  The inertia of links and rotors only weighs the least
+        squares.  For a box of the returned mass, kg, ``reflected`` predicts this impulse.  Impulses are in N·s.
         """
         measured, fitted = self.measured[group], self.fit.models["reflected"]
         links, q = replace(self.fit.arm, rotors=np.zeros(JOINTS)), measured.q
@@ -166,10 +162,12 @@ def lines(request: Request) -> Iterator[str]:
     yield from ("### Loss of tip speed", "", *_losses(evaluations), "")
     yield from ("### Joint jumps", "", *_jumps(evaluations), "")
     yield from ("### Order of the models", "", *_order(evaluations), "")
-    yield "Errors with the jumps as recorded, which contain the shares of trend and controller, and with the contact"
+    yield "Errors with the jumps as recorded, which contain the effects of trend and controller, and with the contact"
     yield "one row later:"
-    later = {group: [moved for hit in hits if (moved := hit.later())] for group, hits in groups.items()}
-    others = {"as recorded": Evaluation(groups, recorded=True), "one row later": Evaluation(later)}
+    later = dict(by_group(moved for hit in hits if (moved := hit.later()) is not None))
+    others = {"as recorded": Evaluation(groups, recorded=True)}
+    if FITTED in later:
+        others["one row later"] = Evaluation(later)
     yield from ("", *_errors(others), "")
     yield from ("### Which inertia", "", *_inertia(best), "")
     yield from ("### Impulse", "", *_impulses(evaluations), "")
@@ -270,11 +268,11 @@ def _order(evaluations: Sequence[Evaluation]) -> Iterator[str]:
         for first, second in pairwise(order):
             better = [each.scores[group, first].error < each.scores[group, second].error for each in others]
             words += f" < {second} ({np.mean(better):.0%})"
-        naive = min(best.scores[group, name].error for name in (TIP, REPEAT))
+        naive = min(best.scores[group, name].error for name in (LINKS, REPEAT))
         error = best.scores[group, order[0]].error
         beats = np.mean([each.scores[group, "reflected"].error < each.scores[group, "link"].error for each in others])
         rows.append([str(group), words, f"{beats:.0%}", f"{error:.2f}", "–" if group == FITTED else f"{naive:.2f}"])
-    head = ["group", "models by error (share of resamples with this order)", "reflected < link", "least error"]
+    head = ["group", "models by error (fraction of resamples with this order)", "reflected < link", "least error"]
     yield from table([*head, "least naive error"], rows)
 
 
