@@ -58,7 +58,7 @@ FrameList = Annotated[
 ]
 Out = Annotated[str | None, out_option("Result folder.", "./ROBOT-FRAME")]
 Force = Annotated[bool, option("--force", OUTPUT, "Replace an existing result folder.")]
-ForceFiles = Annotated[bool, option("--force", OUTPUT, "Replace files that this program did not write.")]
+ForceFiles = Annotated[bool, option("--force", OUTPUT, "Also replace files that you wrote or changed.")]
 Prefix = Annotated[
     str | None,
     option(

@@ -39,7 +39,7 @@ Out = Annotated[
 ]
 Force = Annotated[
     bool,
-    options.option("--force", OUTPUT, "Replace another sweep; with show, files that this program did not write."),
+    options.option("--force", OUTPUT, "Replace another sweep; with show, files that you wrote or changed."),
 ]
 MapAxes = Annotated[
     str | None, options.option("--axes", "Maps", "Axes of the maps.", metavar="A,B", show_default="the two longest")

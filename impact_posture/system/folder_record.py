@@ -27,20 +27,18 @@ def write_record(folder: Path, kind: Kind, products: Iterable[str] = ()) -> None
     Raises:
         OSError: The record cannot be written.
     """
-    paths = sorted(path for path in folder.rglob("*") if not path.is_dir())
     content = {"schema": SCHEMA, "kind": kind, "files": [], "products": sorted(products), **made_by()}
-    text = _with_files(content, folder, paths)
-    (folder / RECORD).write_text(text, encoding="utf-8")
+    (folder / RECORD).write_text(_with_files(content, folder), encoding="utf-8")
 
 
 def extended_record(folder: Path, added: Path) -> str:
     """Return the record of ``folder`` with the files of another folder, ``added``, which move to ``folder``."""
     content = read_record(folder) or {"schema": SCHEMA, "kind": "pictures", "files": [], "products": []}
-    return _with_files(content, added, sorted(added.iterdir()))
+    return _with_files(content, added)
 
 
-def _with_files(content: dict[str, Any], folder: Path, paths: Iterable[Path]) -> str:
-    names = {path.relative_to(folder).as_posix(): path for path in paths}
+def _with_files(content: dict[str, Any], folder: Path) -> str:
+    names = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*") if not path.is_dir()}
     hashes = {name: sha256_of(path) for name, path in names.items() if path.name != RECORD}
     content["files"] = sorted({*content["files"], *names})
     content["sha256"] = dict(sorted({**content.get("sha256", {}), **hashes}.items()))

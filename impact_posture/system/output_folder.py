@@ -149,10 +149,10 @@ def _move(names: Sequence[str], new: Path, out: Path, old: Path, force: bool) ->
                 # Check again, because the file may have been changed since the first check.
                 _check_replaceable(out, name, old / name, force)
     except BaseException:
-        for name in moved:
+        for name in names:
             if os.path.lexists(old / name):
                 os.replace(old / name, out / name)
-            else:
+            elif name in moved:
                 os.unlink(out / name)
         raise
 
