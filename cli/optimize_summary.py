@@ -170,6 +170,17 @@ def _path(page: Page, path: dict[str, Any]) -> None:
         )
         if strike["hindrance"]:
             page.line(f"  {number(strike['stated_speed'])} m/s is not possible, because of {strike['hindrance']}")
+        after = strike["follow_through"]
+        page.line(
+            f"  then stops within {number(after['longest_s'])} s after {after['stopped']} of {after['impacts']} "
+            "considered impacts (restitution 0 to 0.5, 80% to 120% of the speed)"
+        )
+        for what, room in (("joint limit", after["joints"]), ("clearance", after["clearance"])):
+            if room:
+                where = f"{room['of']}, after {room['impact']}"
+                page.line(f"  the least distance from a {what} is {number(room['distance'])} rad (m): {where}")
+        if after["hindrance"]:
+            page.line(f"  {after['hindrance']}")
     # The verdict states why a path does not reach the optimum.
     if path["found"] and path["reason"]:
         page.line(f"  {path['reason']}")

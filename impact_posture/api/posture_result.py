@@ -182,8 +182,11 @@ class PostureResult:
         """
         from impact_posture.path.posture_path import posture_path
 
-        speed = self._prepared.impact.speed if strike else None
-        return replace(self, motion=posture_path(self.solution, seed=seed, strike=speed))
+        if not strike:
+            return replace(self, motion=posture_path(self.solution, seed=seed))
+        impact = self._prepared.impact
+        motion = posture_path(self.solution, seed=seed, strike=impact.speed, restitution=impact.restitution)
+        return replace(self, motion=motion)
 
     @checked
     def save(

@@ -12,9 +12,10 @@ import yaml
 
 from impact_posture.dynamics.chart import Chart
 from impact_posture.errors import printable
+from impact_posture.path.follow_through import FollowThrough, Room
 from impact_posture.path.path_timing import LimitUse
 from impact_posture.path.posture_path import PosturePath
-from impact_posture.path.row_interpolation import INTERPOLATION
+from impact_posture.path.row_interpolation import INTERPOLATION, RowInterpolation
 from impact_posture.path.strike import Strike
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
@@ -37,25 +38,43 @@ def write_path(folder: Path, robot: Robot, path: PosturePath) -> None:
     respects the limits.
 
     The last row of a path with a strike is the contact.  The column ``contact`` of the CSV is 1 there.  The NPZ
-    contains the time of the contact, ``contact``, and a comment in the YAML states it.
+    contains the time of the contact, ``contact``, and a comment in the YAML states it.  The files
+    ``follow_through.*`` contain the stop after the impact, whose first row is the contact.
     """
-    names, angles = positions(robot, path.q)
+    use = {} if path.use is None else {name: getattr(path.use, name) for name in _SHARES}
+    arrays = {"objective": path.objectives, **{f"share_{name}": values for name, values in use.items()}}
+    rows, strike = RowInterpolation(robot.model, path.t, path.q, path.v, path.a), path.strike
+    if strike is None:
+        _write_rows(folder / "path", robot, rows, arrays)
+        return
+    note = f"# The contact is at the last point, at {strike.contact_s:.9g} s."
+    _write_rows(folder / "path", robot, rows, arrays | {"contact": np.array(strike.contact_s)}, note, len(path.t) - 1)
+    if (after := strike.follow_through) is not None and after.rows is not None:
+        note = "# The contact is at the first point, whose velocities are those after the predicted impact."
+        _write_rows(folder / "follow_through", robot, after.rows, {"contact": np.array(0.0)}, note, 0)
+
+
+def _write_rows(
+    stem: Path,
+    robot: Robot,
+    rows: RowInterpolation,
+    arrays: dict[str, Array],
+    note: str = "",
+    contact: int | None = None,
+) -> None:
+    """Write the rows of a motion as CSV, NPZ and YAML; ``contact`` is the row of the contact."""
+    names, angles = positions(robot, rows.q)
     columns = [printable(name) for name in robot.tangent_names]
-    with (folder / "path.csv").open("w", newline="", encoding="utf-8") as file:
+    table = [rows.t, angles, rows.v, rows.a]
+    with stem.with_suffix(".csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         head = [f"{kind}:{name}" for kind, each in (("q", names), ("v", columns), ("a", columns)) for name in each]
-        table = np.column_stack([path.t, angles, path.v, path.a]).tolist()
-        if path.strike is not None:
-            head, table = [*head, "contact"], [[*row, int(row is table[-1])] for row in table]
-        writer.writerow(["t", *head])
-        writer.writerows(table)
-    use = {} if path.use is None else {name: getattr(path.use, name) for name in _SHARES}
-    more: dict[str, Any] = {} if path.strike is None else {"contact": path.strike.contact_s}
-    np.savez_compressed(
-        folder / "path.npz", t=path.t, q=path.q, v=path.v, a=path.a, objective=path.objectives,
-        **{f"share_{name}": values for name, values in use.items()}, **more,
-    )  # fmt: skip
-    (folder / "path.yaml").write_text(_trajectory(robot, path, angles), encoding="utf-8")
+        writer.writerow(["t", *head, *([] if contact is None else ["contact"])])
+        for k, row in enumerate(np.column_stack(table).tolist()):
+            writer.writerow([*row, *([] if contact is None else [int(k == contact)])])
+    every: dict[str, Any] = {**{key: getattr(rows, key) for key in "tqva"}, **arrays}
+    np.savez_compressed(stem.with_suffix(".npz"), **every)
+    stem.with_suffix(".yaml").write_text(_trajectory(robot, rows, angles, note), encoding="utf-8")
 
 
 def read_path(folder: Path, block: Mapping[str, Any], robot: Robot) -> PosturePath:
@@ -63,31 +82,45 @@ def read_path(folder: Path, block: Mapping[str, Any], robot: Robot) -> PosturePa
 
     Raise ``ValueError`` if the arrays do not fit each other or the robot.
     """
-    arrays = {key: np.asarray(array, dtype=float) for key, array in read_arrays(folder / "path.npz").items()}
+    arrays = _read_rows(folder / "path.npz", robot)
     shares = {key.removeprefix("share_"): array for key, array in arrays.items() if key.startswith("share_")}
-    count, samples = arrays["t"].size, arrays["objective"].size
-    wanted = {"t": (count,), "q": (count, robot.nq), "v": (count, robot.nv), "a": (count, robot.nv)}
-    wanted |= {"objective": (samples,), **{f"share_{name}": (samples,) for name in shares}}
-    for key, shape in wanted.items():
-        finite = key in ("share_torque", "share_thrust") or np.isfinite(arrays[key]).all()
-        if arrays[key].shape != shape or not finite or (np.abs(arrays[key]) > _LARGEST).any():
-            raise ValueError(f"'{key}' of path.npz does not fit the path of {robot.name}")
-    if count == 0 or (np.diff(arrays["t"]) <= 0).any():
-        raise ValueError("the times of path.npz do not increase")
     return PosturePath(
         **{key: block[key] for key in _BLOCK},
         t=arrays["t"], q=arrays["q"], v=arrays["v"], a=arrays["a"],
         use=LimitUse(**shares, largest=block["limits"]) if shares else None,
         objectives=arrays["objective"],
-        strike=_strike(block["strike"], robot) if "strike" in block else None,
+        strike=_read_strike(folder, block["strike"], robot) if "strike" in block else None,
     )  # fmt: skip
 
 
-def _strike(block: Mapping[str, Any], robot: Robot) -> Strike:
-    velocity = np.array(block["velocity"], dtype=float)
-    if velocity.shape != (robot.nv,) or not np.isfinite(velocity).all():
+def _read_rows(file: Path, robot: Robot) -> dict[str, Array]:
+    """Return the checked arrays of a motion."""
+    arrays = {key: np.asarray(array, dtype=float) for key, array in read_arrays(file).items()}
+    count, samples = arrays["t"].size, arrays["objective"].size if "objective" in arrays else 0
+    wanted = {"t": (count,), "q": (count, robot.nq), "v": (count, robot.nv), "a": (count, robot.nv), "contact": ()}
+    for key in arrays:
+        shape = wanted.get(key, (samples,))
+        finite = key in ("share_torque", "share_thrust") or np.isfinite(arrays[key]).all()
+        if arrays[key].shape != shape or not finite or (np.abs(arrays[key]) > _LARGEST).any():
+            raise ValueError(f"'{key}' of {file.name} does not fit the path of {robot.name}")
+    if count == 0 or (np.diff(arrays["t"]) <= 0).any():
+        raise ValueError(f"the times of {file.name} do not increase")
+    return arrays
+
+
+def _read_strike(folder: Path, block: Mapping[str, Any], robot: Robot) -> Strike:
+    """Return the strike of a path from its block in ``result.json`` and ``follow_through.npz``."""
+    after = {key: value for key, value in block["follow_through"].items() if key != "duration_s"}
+    velocities = [np.array(part["velocity"], dtype=float) for part in (block, after)]
+    if not all(v.shape == (robot.nv,) and np.isfinite(v).all() for v in velocities):
         raise ValueError(f"the velocity of the strike does not fit {robot.name}")
-    return Strike(**{**block, "velocity": velocity})
+    rows = None
+    if block["follow_through"]["duration_s"] is not None:
+        arrays = _read_rows(folder / "follow_through.npz", robot)
+        rows = RowInterpolation(robot.model, *(arrays[key] for key in "tqva"))
+    after |= {key: Room(**after[key]) for key in ("joints", "clearance") if after[key] is not None}
+    ends = FollowThrough(**after | {"velocity": velocities[1], "rows": rows})
+    return Strike(**{**block, "velocity": velocities[0], "follow_through": ends})
 
 
 def positions(robot: Robot, q: Array) -> tuple[list[str], Array]:
@@ -109,7 +142,7 @@ def positions(robot: Robot, q: Array) -> tuple[list[str], Array]:
     return [printable(name) for name in names], x
 
 
-def _trajectory(robot: Robot, path: PosturePath, angles: Array) -> str:
+def _trajectory(robot: Robot, path: RowInterpolation, angles: Array, note: str) -> str:
     """Return the ``JointTrajectory`` of all joints with one degree of freedom as YAML."""
     slots = [s for s in Chart(robot.model).slots if s.x.stop - s.x.start == 1]
     x, v = [s.x.start for s in slots], [s.v.start for s in slots]
@@ -128,8 +161,7 @@ def _trajectory(robot: Robot, path: PosturePath, angles: Array) -> str:
         f"# Interpolation: {INTERPOLATION} between points, as in joint_trajectory_controller",
     ]
     if robot.floating:
-        lines.append("# The base floats: its pose over time is in path.csv (q:base ...).")
-    if path.strike is not None:
-        lines.append(f"# The contact is at the last point, at {path.strike.contact_s:.9g} s.")
+        lines.append("# The base floats: its pose over time is in the CSV (q:base ...).")
+    lines += [note] if note else []
     lines.append(yaml.safe_dump(message, sort_keys=False, default_flow_style=None, width=10**6))
     return "\n".join(lines)

@@ -10,6 +10,7 @@ import numpy as np
 from impact_posture.errors import InputError
 from impact_posture.impact.objective import Objective
 from impact_posture.path.actuator_limits import ActuatorLimits
+from impact_posture.path.follow_through import follow_through
 from impact_posture.path.path_curve import fitted_curve
 from impact_posture.path.path_search import EFFORT, Connection, connect, shortened
 from impact_posture.path.path_space import PathSpace
@@ -74,6 +75,18 @@ class PosturePath:
         """Duration, s."""
         return float(self.t[-1])
 
+    @property
+    def played(self) -> tuple[Array, Array, Array]:
+        """Times ``t``, postures ``q`` and velocities ``v`` of the path and, after a strike, of the follow-through.
+
+        At the contact, the velocity is that before the impact.
+        """
+        after = self.strike and self.strike.follow_through and self.strike.follow_through.rows
+        if not after:
+            return self.t, self.q, self.v
+        t = np.append(self.t, self.t[-1] + after.t[1:])
+        return t, np.vstack([self.q, after.q[1:]]), np.vstack([self.v, after.v[1:]])
+
     def to_dict(self) -> dict[str, object]:
         """Return JSON content."""
         return {
@@ -101,7 +114,12 @@ def check_package() -> None:
 
 
 def posture_path(
-    solution: PostureSolution, *, seed: int = 0, effort: int = EFFORT, strike: float | None = None
+    solution: PostureSolution,
+    *,
+    seed: int = 0,
+    effort: int = EFFORT,
+    strike: float | None = None,
+    restitution: float = 0.0,
 ) -> PosturePath:
     """Find a path from ``solution.initial`` to ``solution.q`` along which all constraints hold, and time it.
 
@@ -111,7 +129,8 @@ def posture_path(
 
     If ``strike`` is given, the contact point arrives at the optimum with this speed, m/s
     (:mod:`~impact_posture.path.strike`).  If no optimum can be struck at this speed, the path strikes the optimum
-    with the greatest speed.  If no optimum can be struck at all, the path ends at rest.
+    with the greatest speed.  If no optimum can be struck at all, the path ends at rest.  ``restitution`` is the
+    coefficient of the predicted impact, after which :mod:`~impact_posture.path.follow_through` stops the robot.
 
     Raises:
         InputError: The package of the extra ``path`` is not installed, or the contact cannot strike.
@@ -121,7 +140,7 @@ def posture_path(
     limits, no_strike = ActuatorLimits(objective, start, solution.problem.requirements), ""
     if strike is not None:
         check_strike(solution.problem, strike)
-        struck = _struck(solution, space, limits, strike, seed, effort)
+        struck = _struck(solution, space, limits, strike, restitution, seed, effort)
         if isinstance(struck, PosturePath):
             return struck
         no_strike = f"the path ends at rest, because {struck}"
@@ -169,7 +188,13 @@ def _finished(
 
 
 def _struck(
-    solution: PostureSolution, space: PathSpace, limits: ActuatorLimits, speed: float, seed: int, effort: int
+    solution: PostureSolution,
+    space: PathSpace,
+    limits: ActuatorLimits,
+    speed: float,
+    restitution: float,
+    seed: int,
+    effort: int,
 ) -> PosturePath | str:
     """Return the path that strikes the first optimum with the stated or else the greatest speed; or why none does."""
     start, objective = solution.initial, solution.problem.objective
@@ -207,6 +232,8 @@ def _struck(
             shift = float(there.rows.t[-1])
             motion = TimedCurve(there.rows.followed_by(motion.rows), there.method, (*there.notes, *motion.notes))
             strike = replace(strike, run_up_s=shift, contact_s=float(motion.rows.t[-1]))
+        after = follow_through(solution.problem, motion.rows.q[-1], strike.velocity, restitution, limits)
+        strike = replace(strike, follow_through=after)
         failure = f"{first}; the path ends at optimum number {k + 1} of {len(solution.optima)}" if k else ""
         return _finished(before, motion, connection.method, limits, failure, strike=strike)
     return first or "no optimum can be struck"

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import daqp
 import numpy as np
@@ -11,14 +10,13 @@ import numpy as np
 from impact_posture.config.json_block import JsonBlock
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import InputError
-from impact_posture.impact.impact_contact import point_on
 from impact_posture.path.actuator_limits import ActuatorLimits
+from impact_posture.path.follow_through import FollowThrough
 from impact_posture.path.path_space import PathSpace
-from impact_posture.path.stroke import Stroke
+from impact_posture.path.strike_spaces import StrikeSpaces
+from impact_posture.path.stroke import shortest_stroke
 from impact_posture.path.timed_curve import TimedCurve, sampled
-from impact_posture.posture.constraints.clearance import Clearance
-from impact_posture.posture.constraints.pose_constraints import HeldPose, PositionAlong
-from impact_posture.posture.program.constrained_problem import ConstrainedProblem, equality_jacobian
+from impact_posture.posture.program.constrained_problem import ConstrainedProblem
 from impact_posture.system.arrays import Array
 
 # Weight of the squared velocities, relative to their limits, beside the largest of them.
@@ -27,8 +25,6 @@ _UNIQUE = 1e-4
 _ACTIVE = 1e-3
 # A contact velocity that the joints miss by more than this share cannot be reached.
 _MISSED = 1e-9
-# Longest run-up, as time at the impact speed, s.
-_LONGEST = 0.5
 # Number of bisections for the greatest speed.
 _STEPS = 7
 
@@ -46,6 +42,7 @@ class Strike(JsonBlock):
         velocity: Generalized velocity at the contact, shape (nv,).
         share: Largest share of a velocity limit at the contact.
         hindrance: What prevents the stated speed; empty if it is reached.
+        follow_through: The stop after the impact.
     """
 
     speed: float
@@ -56,6 +53,7 @@ class Strike(JsonBlock):
     velocity: Array
     share: float
     hindrance: str = ""
+    follow_through: FollowThrough | None = None
 
 
 def check_strike(problem: ConstrainedProblem, speed: float) -> None:
@@ -69,52 +67,6 @@ def check_strike(problem: ConstrainedProblem, speed: float) -> None:
         fault, hint = "needs an approach speed above zero", "give `speed`"
     if fault:
         raise InputError(fault, where="strike", hint=hint)
-
-
-class StrikeSpaces:
-    """The constraints of a strike at a posture ``q``, shape (nq,), for the motions before and after the impact.
-
-    The surface stays where it is at ``q``.  The contact point may not enter it.
-
-    Attributes:
-        normal: Normal of the surface at ``q``, world axes, shape (3,).
-        approach: Postures on the way to the run-up.  The orientation of the contact frame is held as at the optimum.
-        run_up: Postures of the run-up.  In addition, the contact point is on the normal through its place at ``q``.
-        rebound: Postures after the impact.  The contact frame is free.
-    """
-
-    def __init__(self, problem: ConstrainedProblem, q: Array, *, turns: bool = False) -> None:
-        (contact,), numeric = problem.objective.contacts, Numeric(problem.robot.model).at(q)
-        self._point = point_on(problem.robot, contact.frame, contact.offset)
-        at, n = numeric.placement(self._point), np.array(contact.normal)
-        self.normal = np.asarray(at.rotation @ n) if contact.normal_frame == "contact" else n
-        tangents = np.linalg.svd(self.normal[None])[2][1:]
-        first = len(problem.objective.supports)
-        # The constraint on the position comes first.  A constraint on the tilt may follow.
-        count = 2 if problem.requirements.contact_pose.startswith("aligned:") else 1
-        position, *tilt = problem.constraints[first : first + count]
-        turned = [] if turns else [position.orientation, *tilt] if isinstance(position, HeldPose) else tilt
-        still = {} if problem.surroundings is None else {
-            c.name: c for c in problem.surroundings.fixed_at(q).constraints
-        }  # fmt: skip
-        rest = [
-            still[c.name] if isinstance(c, Clearance) else c
-            for k, c in enumerate(problem.constraints)
-            if not (first <= k < first + count or c.at_impact)
-        ]
-        contact_at = self._point, at.translation
-        above = PositionAlong("contact above the surface", *contact_at, self.normal[None], 0.0, np.inf)
-        line = PositionAlong("contact on the normal", *contact_at, tangents, 0.0, 0.0)
-        self.approach, self.run_up, self.rebound = (
-            PathSpace(replace(problem, constraints=(*rest, above, *more), rows=()))
-            for more in (turned, [*turned, line], [])
-        )
-
-    def rows(self, space: PathSpace) -> Callable[[Numeric], Array]:
-        """Return a function for the matrix ``(J_equalities; nᵀJ)`` of a space, shape (m, nv)."""
-        return lambda model: np.vstack(
-            [equality_jacobian(space.problem, model), self.normal @ model.jacobian(self._point)[:3]]
-        )
 
 
 def _leaving(space: PathSpace, q: Array) -> Array:
@@ -196,14 +148,14 @@ def run_up(problem: ConstrainedProblem, q: Array, speed: float, limits: Actuator
     else:
         return "the joints cannot move the contact along the normal"
     space, (velocity, share) = spaces.run_up, impact
-    stroke = Stroke(space, q, velocity, spaces.rows(space), _LONGEST / max(1.0, share), before=True)
-    if stroke.curve is None:
-        return f"no run-up is possible, because of {stroke.end}"
     low, high, hindrance = 0.0, 1.0, ""
     if share > 1:
         worst = int(np.argmax(np.abs(velocity) / problem.robot.velocity_limits))
         high, hindrance = 1 / share, f"the velocity of {problem.robot.tangent_names[worst]}"
-    duration = stroke.shortest(limits, high)
+    rows = spaces.rows(space)
+    stroke, duration = shortest_stroke(space, q, velocity, rows, limits, before=True, factor=high)
+    if stroke.curve is None:
+        return f"no run-up is possible, because of {stroke.end}"
     if duration is not None:
         low = high
     for _ in range(_STEPS if duration is None else 0):

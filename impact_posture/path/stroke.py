@@ -16,8 +16,10 @@ from impact_posture.path.time_law import TimeLaw, polynomial, whole
 from impact_posture.path.timed_curve import moment
 from impact_posture.system.arrays import Array
 
+# Lengths of a stroke, as time at the velocity of the impact, s: the second one is used if the first one is too short.
+_SHORT, _LONG = 0.1, 0.5
 # Tangent length between two knots of a stroke, and largest tangent length, rad mixed with m.
-_KNOTS, _LONGEST = STEP / 2, 1.5
+_KNOTS, _FARTHEST = STEP / 2, 1.5
 # Least number of knots, and how often the length of a curve is halved until its knots suffice.
 _LEAST, _HALVINGS = 8, 3
 # A stroke ends where its velocity exceeds this multiple of the velocity at its posture.
@@ -78,7 +80,7 @@ class Stroke:
             return np.asarray(u + np.linalg.pinv(A, rcond=_RANK) @ (kept - A @ u))
 
         size = float(np.linalg.norm(u))
-        self.time = min(time, _LONGEST / size)
+        self.time = min(time, _FARTHEST / size)
         count = max(_LEAST, int(np.ceil(self.time * size / _KNOTS)))
         for _ in range(_HALVINGS + 1):
             h, postures, self.end = (-1 if before else 1) * self.time / count, [q], ""
@@ -167,5 +169,24 @@ class Stroke:
         """Return what prevents a motion with the velocity ``factor u``: the limit that it exceeds least, and why."""
         durations = np.geomspace(min(_SHORTEST, self.time / factor), 2 * self.time / factor, 12)
         least = min((self.need(limits, d, factor) for d in durations), key=lambda need: need.share)
-        room = f"; no longer run-up is possible, because of {self.end}" if self.end else ""
+        room = f", and the motion cannot be longer because of {self.end}" if self.end else ""
         return least.of + room
+
+
+def shortest_stroke(
+    space: PathSpace,
+    q: Array,
+    u: Array,
+    rows: Callable[[Numeric], Array],
+    limits: ActuatorLimits,
+    *,
+    before: bool,
+    factor: float = 1.0,
+) -> tuple[Stroke, float | None]:
+    """Return a stroke and its shortest duration within the limits, s; ``None`` if it has none."""
+    for time in (_SHORT, _LONG):
+        stroke = Stroke(space, q, u, rows, time, before=before)
+        duration = None if stroke.curve is None else stroke.shortest(limits, factor)
+        if duration is not None or stroke.end:
+            break
+    return stroke, duration

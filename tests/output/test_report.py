@@ -175,7 +175,7 @@ def test_every_contact_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     result.save(tmp_path / "out", codegen=False, report=False, jobs=1)
     # In the recorded run, the velocity jump of the impact takes 15 ms.
     monkeypatch.setattr(
-        "impact_posture.output.report.result_report._frames", lambda view: (np.arange(2.0), "", view.path.q[:2])
+        "impact_posture.output.report.result_report._frames", lambda view: (np.arange(2.0), "", view.path.q[:2], None)
     )
     prepared, view, _ = load_result(tmp_path / "out")
     scene = result_scene(prepared, view)

@@ -15,8 +15,13 @@ from scipy.optimize import linprog
 
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import InputError
+from impact_posture.impact.evaluation.coulomb_jump import coulomb_jump
 from impact_posture.impact.impact_contact import ImpactContact, point_on
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.output.report.result_report import result_scene
+from impact_posture.output.result_reader import load_result
+from impact_posture.path.actuator_limits import ActuatorLimits
+from impact_posture.path.follow_through import after_impact, follow_through
 from impact_posture.path.path_files import read_path, write_path
 from impact_posture.path.posture_path import PosturePath, posture_path
 from impact_posture.path.row_interpolation import RowInterpolation
@@ -149,9 +154,9 @@ def cart(effort: float, speed: float) -> tuple[str, ...]:
     return link("base"), link("cart", 2.0), joint("slide", "base cart", "1 0 0", "0 0 1", "prismatic", limit)
 
 
-def slider(folder: Path, effort: float, speed: float) -> PostureSolution:
+def slider(folder: Path, effort: float, speed: float, cone: float = 0.0) -> PostureSolution:
     loaded = load(folder, *cart(effort, speed), toml=WALL)
-    objective = WorstCaseObjective(loaded, ImpactContact("cart", (-1, 0, 0)))
+    objective = WorstCaseObjective(loaded, ImpactContact("cart", (-1, 0, 0)), normal_cone_deg=cone)
     problem = build_problem(loaded, objective, loaded.posture(), Requirements(contact_pose="position"))
     return solve(problem, starts=1, jobs=1)
 
@@ -162,7 +167,7 @@ def test_the_greatest_speed_of_a_cart_follows_from_its_run_up(tmp_path: Path) ->
     strike = path.strike
     greatest = np.sqrt(_SHARE * 4.0 / 2.0 * 0.1 / 0.75)
     assert strike is not None and strike.speed == pytest.approx(greatest, rel=0.02) and strike.speed < greatest
-    assert strike.hindrance == "the torque of slide; no longer run-up is possible, because of joint limits"
+    assert strike.hindrance == "the torque of slide, and the motion cannot be longer because of joint limits"
     assert strike.run_up_m == pytest.approx(0.1, rel=0.05) and path.found
 
 
@@ -204,6 +209,78 @@ def test_the_surface_stays_in_the_world_while_the_contact_backs_off() -> None:
     assert name == same and fixed - moving == pytest.approx(strike.run_up_m, rel=1e-3)
 
 
+@pytest.mark.parametrize("name", ["panda", "solo8"])
+def test_the_stop_after_the_impact_starts_at_the_predicted_velocity(name: str) -> None:
+    """The oracles are the predicted jump of evaluate, RNEA, and the frames of Pinocchio."""
+    solution, path = struck(name)
+    problem, strike = solution.problem, path.strike
+    assert strike is not None and strike.follow_through is not None
+    after, model = strike.follow_through, problem.robot.model
+    jump = coulomb_jump(problem.impact, path.q[-1], SPEED)
+    assert jump is not None and after.stopped == after.impacts == 7 and not after.hindrance
+    np.testing.assert_allclose(after.velocity, path.v[-1] + jump.velocity, atol=1e-9)
+    rows = after.rows
+    assert rows is not None
+    free = ~np.isin(problem.robot.tangent_names, problem.requirements.hold)
+    np.testing.assert_allclose(rows.v[0][free], after.velocity[free], atol=1e-5)
+    assert np.abs(rows.v[-1]).max() < 1e-12 and np.array_equal(rows.q[0], path.q[-1])
+    n, h, data = np.array(problem.objective.contacts[0].normal), 1e-5, model.createData()
+    home = contact_of(problem, path.q[-1])[0].translation
+    for t in np.linspace(h, rows.t[-1] - h, 30):
+        q, v, a = rows.at(t)
+        (before, slow, _), (behind, fast, _) = rows.at(t - h), rows.at(t + h)
+        assert np.abs(pin.difference(model, before, behind) / (2 * h) - v).max() < 1e-4
+        assert np.abs((fast - slow) / (2 * h) - a).max() < 1e-2 * max(1.0, np.abs(rows.a).max())
+        assert n @ (contact_of(problem, q)[0].translation - home) > -1e-6
+        if not problem.robot.floating:
+            assert (np.abs(pin.rnea(model, data, q, v, a)) <= model.effortLimit).all()
+        for constraint in problem.constraints[: len(problem.objective.supports)]:
+            assert np.abs(constraint.value(Numeric(model).at(q))).max() < 1e-5
+
+
+@pytest.mark.parametrize(("effort", "cone"), [(8.0, 0.0), (8.0, 10.0), (5.0, 0.0)])
+def test_a_cart_stops_before_the_end_of_its_slide_or_says_why(tmp_path: Path, effort: float, cone: float) -> None:
+    """The worst impact is 120 % of 1 m/s with restitution 0.5.  The stop needs T = 3/2 v m/F and v T/2."""
+    problem = slider(tmp_path, effort, 9.0, cone).problem
+    limits = ActuatorLimits(problem.objective, problem.given, problem.requirements)
+    after = follow_through(problem, problem.given, np.array([1.0]), 0.25, limits)
+    assert after.impacts == (31 if cone else 7) and after.velocity == pytest.approx([-0.25])
+    duration = 1.5 * 0.6 * 2.0 / (_SHARE * effort)
+    if 0.3 * duration > 0.1:
+        assert after.hindrance == (
+            "no stop is possible, because of the torque of slide, and the motion cannot be longer because of joint "
+            "limits, after restitution 0.5, 120% of the speed"
+        )
+        assert after.stopped == 6
+        return
+    assert not after.hindrance and after.longest_s == pytest.approx(duration, rel=0.02)
+    assert after.joints is not None and after.joints.distance == pytest.approx(0.1 - 0.3 * duration, abs=2e-3)
+    assert (after.joints.of, after.joints.impact[:32]) == ("joint slide", "restitution 0.5, 120% of the spe")
+    assert after.clearance is None
+
+
+def test_an_impact_on_a_tilted_surface_satisfies_the_laws_of_friction() -> None:
+    solution, path = struck("panda")
+    problem, q, v = solution.problem, path.q[-1], path.v[-1]
+    n = np.array([np.sin(0.2), 0.0, np.cos(0.2)])
+    tilted = StrikeSpaces(problem, q, normal=n)
+    jump, plastic = (after_impact(problem, tilted, q, v, e) for e in (0.5, 0.0))
+    assert jump is not None and plastic is not None
+    np.testing.assert_allclose(jump - v, 1.5 * (plastic - v), atol=1e-12)
+    J = contact_of(problem, q)[1][:3]
+    M = pin.crba(problem.robot.model, problem.robot.model.createData(), q)
+    M = np.triu(M) + np.triu(M, 1).T
+    force, along = M @ (plastic - v), J @ plastic
+    free = ~problem.robot.followers
+    p = np.linalg.lstsq((J @ problem.robot.projector).T, problem.robot.projector.T @ force, rcond=None)[0]
+    np.testing.assert_allclose((J @ problem.robot.projector).T @ p, problem.robot.projector.T @ force, atol=1e-8)
+    assert free.any() and abs(n @ along) < 1e-8 and n @ p > 0
+    side, slip = p - (n @ p) * n, along - (n @ along) * n
+    friction = problem.objective.contacts[0].friction
+    assert np.linalg.norm(side) <= friction * (n @ p) + 1e-7
+    assert np.linalg.norm(slip) < 1e-6 or np.linalg.norm(side) == pytest.approx(friction * (n @ p))
+
+
 def test_files_mark_the_contact(tmp_path: Path) -> None:
     solution, path = struck("solo8")
     loaded, strike = solution.problem.robot, path.strike
@@ -217,8 +294,15 @@ def test_files_mark_the_contact(tmp_path: Path) -> None:
     block = json.loads(json.dumps(path.to_dict(), allow_nan=False))
     assert read_path(tmp_path, block, loaded).to_dict() == path.to_dict()
     page = (Path(__file__).parents[2] / "docs" / "reference" / "result-json.md").read_text(encoding="utf-8")
-    (row,) = (line for line in page.splitlines() if line.startswith("| `path.strike`"))
-    assert all(f"`{key}`" in row for key in block["strike"])
+    rows = [line for line in page.splitlines() if line.startswith("| `path.strike")]
+    assert all(f"`{key}`" in rows[0] for key in block["strike"])
+    assert all(f"`{key}`" in rows[1] for key in block["strike"]["follow_through"])
+    with (tmp_path / "follow_through.csv").open(newline="") as file:
+        first = next(csv.DictReader(file))
+    assert (first["t"], first["contact"]) == ("0.0", "1")
+    t, q, v = path.played
+    assert t[len(path.t) - 1] == strike.contact_s and (np.diff(t) > 0).all() and len(t) == len(q) == len(v)
+    assert not v[-1].any()
     block["strike"]["velocity"].pop()
     with pytest.raises(ValueError, match="does not fit solo8"):
         read_path(tmp_path, block, loaded)
@@ -233,12 +317,21 @@ def test_the_command_prints_the_strike_and_what_bounds_it(tmp_path: Path) -> Non
     done = run(*command, "--path", "--out", "out", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     text = " ".join(done.stdout.split())
+    assert "then stops within" in text and "of 7 considered impacts" in text
     assert "strikes at 0.5 m/s, with 6% of the velocity limits" in text
     assert "2 m/s is not possible, because of the torque of slide" in text
     document = json.loads((tmp_path / "out" / "result.json").read_text())
     assert "strike = true" in (tmp_path / "out" / "problem.toml").read_text()
     # The verdict states first that the stated speed is not reached.
     assert document["verdict"]["line"].startswith("verdict: cannot arrive at 2 m/s (0.5 m/s at most)")
+    # The page plays the path, the contact and the stop.
+    prepared, view, _ = load_result(tmp_path / "out")
+    (track,) = result_scene(prepared, view).tracks
+    strike, speed = document["path"]["strike"], {name: values for name, _, values in track.curves}
+    assert track.times[-1] == pytest.approx(strike["contact_s"] + strike["follow_through"]["duration_s"])
+    towards = speed["speed of the contact towards the surface"]
+    assert towards[list(track.times).index(strike["contact_s"])] == pytest.approx(strike["speed"]) == towards.max()
+    assert speed["largest share of a velocity limit"].max() == pytest.approx(strike["speed"] / 9.0)
 
 
 @pytest.mark.parametrize(

@@ -78,7 +78,7 @@ def result_scene(prepared: Prepared, view: ResultView, meshes: bool = False) -> 
 
 
 def _track(prepared: Prepared, view: ResultView) -> Track:
-    times, unit, q = _frames(view)
+    times, unit, q, v = _frames(view)
     objective, stiffness = view.objective, prepared.impact.contact_stiffness
     impacts = [[single.oracle.quantities(at) for at in q] for single in objective.singles]
     jumps, impulses = _jumps(view, q)
@@ -90,6 +90,12 @@ def _track(prepared: Prepared, view: ResultView) -> Track:
             masses = [contact_mass(single.oracle, at) for at in q]
             peaks = [np.nan if mass is None else stiffness.peak_force(mass, view.speed) for mass in masses]
             curves.append((f"peak force{where}", "N", np.array(peaks)))
+    if v is not None:
+        each = objective.singles[0]
+        speeds = [-(each.oracle.at(at).n @ each.oracle.J @ nu) for at, nu in zip(q, v, strict=True)]
+        curves.append(("speed of the contact towards the surface", "m/s", np.array(speeds)))
+        shares = (np.abs(v) / view.robot.velocity_limits).max(axis=1)
+        curves.append(("largest share of a velocity limit", "1", shares))
     return Track("", times, unit, q, impacts, jumps, tuple(curves))
 
 
@@ -120,16 +126,21 @@ def _together(view: ResultView) -> bool:
     return bool(view.objective.others) and all(coulomb_jumps(view.objective, q, view.speed) for q in ends)
 
 
-def _frames(view: ResultView) -> tuple[Array, str, Array]:
-    """Return the times (or path lengths) of all frames, their unit, and the postures at the frames."""
+def _frames(view: ResultView) -> tuple[Array, str, Array, Array | None]:
+    """Return the times (or path lengths) of all frames, their unit, and the postures at the frames.
+
+    The fourth value contains the generalized velocities at the frames of a strike, which include the contact.
+    """
     if view.motion is not None and len(view.motion.t) > 1:
-        kept = np.unique(np.linspace(0, len(view.motion.t) - 1, _MOST).astype(int))
-        return view.motion.t[kept], "s", view.motion.q[kept]
+        (t, q, v), strike = view.motion.played, view.motion.strike
+        contact = [] if strike is None else [len(view.motion.t) - 1]
+        kept = np.unique([*contact, *np.linspace(0, len(t) - 1, _MOST).astype(int)])
+        return t[kept], "s", q[kept], None if strike is None else v[kept]
     if view.path is not None and view.path.s[-1] > 0:
         # Remove repeated points, because the path lengths of frames must increase.
         kept = np.flatnonzero(np.diff(view.path.s, prepend=-1.0) > 0)
-        return view.path.s[kept], "", view.path.q[kept]
-    return np.array([0.0, 1.0]), "", np.array([view.q_initial, view.q_optimal])
+        return view.path.s[kept], "", view.path.q[kept], None
+    return np.array([0.0, 1.0]), "", np.array([view.q_initial, view.q_optimal]), None
 
 
 def _content(folder: Path, prepared: Prepared, view: ResultView, document: dict[str, Any]) -> Content:
@@ -205,6 +216,8 @@ def _moves(view: ResultView, document: dict[str, Any]) -> str:
         arrows += f", {'of the plastic impact at all contacts at once' if _together(view) else alone}"
     if view.motion is not None and len(view.motion.t) > 1:
         end = "the optimum" if document["path"]["found"] else "the best posture that was reached"
+        if view.motion.strike is not None:
+            end += f", which it strikes at {view.motion.strike.contact_s:.3g} s, and the stop after the impact"
         return f"The slider follows the motion of --path from the initial posture to {end}, over time. {arrows}."
     return (
         "The slider follows the straight line between the two postures, each point pulled onto the constraints. "

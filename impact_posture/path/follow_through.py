@@ -1,0 +1,174 @@
+"""The motion after the impact of a strike: it brings the robot to rest, also from states beside the predicted one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from impact_posture.config.json_block import jsonable
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.impact.friction.contact_impulses import contact_impulses
+from impact_posture.impact.worst_case.worst_normal import cone_axes
+from impact_posture.path.actuator_limits import ActuatorLimits
+from impact_posture.path.path_space import PathSpace
+from impact_posture.path.row_interpolation import RowInterpolation
+from impact_posture.path.strike_spaces import StrikeSpaces
+from impact_posture.path.stroke import Stroke, shortest_stroke
+from impact_posture.path.timed_curve import moment, sampled
+from impact_posture.posture.constraints.clearance import Clearance
+from impact_posture.posture.program.constrained_problem import ConstrainedProblem, equality_jacobian
+from impact_posture.system.arrays import Array
+
+# The states beside the predicted one: coefficients of restitution, and factors on the velocity before the impact.
+RESTITUTIONS, FACTORS = (0.0, 0.5), (0.8, 1.0, 1.2)
+# Number of normals on the edge of the cone.
+_EDGE = 4
+# Number of postures of a stop at which its distances are measured.
+_POSTURES = 12
+
+
+@dataclass(frozen=True)
+class Room:
+    """The least distance along stops: ``distance`` (rad or m), what is near, and after which impact."""
+
+    distance: float
+    of: str
+    impact: str
+
+
+@dataclass(frozen=True, eq=False)
+class FollowThrough:
+    """The stop after the predicted impact, and the room that stops after all considered impacts leave.
+
+    Attributes:
+        velocity: Predicted generalized velocity after the impact, ``ν + Δν``, shape (nv,).
+        rows: The motion from this velocity to rest; ``None`` if it does not exist.
+        impacts: Number of impacts: the predicted one, and each restitution in :data:`RESTITUTIONS` with each factor
+            in :data:`FACTORS` on the velocity before the impact, for the normal and for normals on the edge of the
+            cone of normals.
+        stopped: Number of these impacts after which a stop within the limits exists.
+        longest_s: Duration of the longest of these stops, s.
+        joints: Least distance from a joint limit; ``None`` without limits.
+        clearance: Least distance between links and other bodies minus the clearance; ``None`` without shapes.
+        hindrance: What prevents a stop, and after which impact; empty if all exist.
+    """
+
+    velocity: Array
+    rows: RowInterpolation | None
+    impacts: int
+    stopped: int
+    longest_s: float
+    joints: Room | None
+    clearance: Room | None
+    hindrance: str = ""
+
+    def to_dict(self) -> dict[str, object]:
+        """Return JSON content, without the rows."""
+        duration = None if self.rows is None else float(self.rows.t[-1])
+        content = {key: value for key, value in vars(self).items() if key != "rows"}
+        return jsonable({"duration_s": duration, **content})  # type: ignore[no-any-return]
+
+
+def after_impact(
+    problem: ConstrainedProblem, spaces: StrikeSpaces, q: Array, velocity: Array, restitution: float
+) -> Array | None:
+    """Return ``ν + (1 + e) M⁻¹Jᵀp``, shape (nv,), with the impulse ``p`` of a plastic impact with friction.
+
+    The velocity before the impact need not be along the normal.  Return ``None`` if the iteration for ``p`` does not
+    converge.
+    """
+    impact = problem.impact
+    oracle = impact.oracle.at(q)
+    responses = oracle.solve(oracle.J.T)
+    before = spaces.contact_velocity(Numeric(problem.robot.model).at(q), velocity)
+    normals, friction = spaces.normal[None], np.array([impact.contact.friction])
+    p = contact_impulses(oracle.J @ responses, before[None], normals, friction)
+    return None if p is None else velocity + (1 + restitution) * responses @ p[0]
+
+
+def follow_through(
+    problem: ConstrainedProblem, q: Array, velocity: Array, restitution: float, limits: ActuatorLimits
+) -> FollowThrough:
+    """Return the stop after the impact at ``q`` with the velocity ``ν``, shape (nv,), within the limits.
+
+    Joints that the problem holds, and feet, count as still.  The velocity after the impact may exceed the limits.
+    """
+    spaces = StrikeSpaces(problem, q)
+    around, cone, axes = {"": spaces}, np.deg2rad(problem.impact.normal_cone_deg), cone_axes(spaces.normal)
+    for k in range(_EDGE if cone > 0 else 0):
+        angle = 2 * np.pi * k / _EDGE
+        tilted = axes @ [np.cos(cone), np.sin(cone) * np.cos(angle), np.sin(cone) * np.sin(angle)]
+        around[f", normal {k + 1} on the edge of the cone"] = StrikeSpaces(problem, q, normal=tilted)
+    spread = product(RESTITUTIONS, FACTORS, around.items())
+    impacts = {
+        f"restitution {e:g}, {factor:.0%} of the speed{where}": (at, factor, e) for e, factor, (where, at) in spread
+    }
+    impacts = {"the predicted impact": (spaces, 1.0, restitution), **impacts}
+    after = {name: after_impact(problem, at, q, factor * velocity, e) for name, (at, factor, e) in impacts.items()}
+    stops, hindrance, rows = list[_Stop](), "", None
+    for name, (at, *_) in impacts.items():
+        state = after[name]
+        stop = "no impulse is known" if state is None else _stop(at, q, state, limits)
+        if isinstance(stop, str):
+            hindrance = hindrance or f"{stop}, after {name}"
+            continue
+        stops.append(_Stop(name, *stop))
+    if stops and stops[0].name == next(iter(impacts)):
+        stroke, duration = stops[0].stroke, stops[0].duration
+        assert stroke.curve is not None  # noqa: S101 (narrows a type)
+        rows = sampled(spaces.rebound, stroke.curve, limits, stroke.law(duration), "").rows
+    near = [room for stop in stops for room in stop.rooms(spaces.rebound)]
+    predicted = next(iter(after.values()))
+    return FollowThrough(
+        velocity if predicted is None else predicted,
+        rows,
+        len(impacts),
+        len(stops),
+        max((stop.duration for stop in stops), default=0.0),
+        min((room for room in near if room.of.startswith("joint ")), key=lambda room: room.distance, default=None),
+        min((room for room in near if " / " in room.of), key=lambda room: room.distance, default=None),
+        hindrance,
+    )
+
+
+def _stop(spaces: StrikeSpaces, q: Array, velocity: Array, limits: ActuatorLimits) -> tuple[Stroke, float] | str:
+    """Return the shortest stop from a velocity, and its duration, s; or why none exists.
+
+    The curve keeps the rebound: the normal velocity of the contact point divided by the length of the curve.
+    """
+    space = spaces.rebound
+    held = equality_jacobian(space.problem, Numeric(space.model).at(q))
+    velocity = velocity - np.linalg.pinv(held, rcond=1e-9) @ (held @ velocity)
+    stroke, duration = shortest_stroke(space, q, velocity, spaces.rows(space), limits, before=False)
+    if stroke.curve is None:
+        return f"no stop is possible, because of {stroke.end}"
+    return (
+        f"no stop is possible, because of {stroke.hindrance(limits, 1.0)}" if duration is None else (stroke, duration)
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Stop:
+    name: str
+    stroke: Stroke
+    duration: float
+
+    def rooms(self, space: PathSpace) -> Iterator[Room]:
+        """Yield the distances from joint limits, and from the nearest bodies, at postures of the stop."""
+        assert self.stroke.curve is not None  # noqa: S101 (narrows a type)
+        chart, problem, law = space.projector.chart, space.problem, self.stroke.law(self.duration)
+        (in_v, in_x), numeric = chart.bounded, space.projector.numeric
+        for t in np.linspace(0.0, law.duration, _POSTURES):
+            q = moment(self.stroke.curve, law, float(t))[0]
+            x, low, high = chart.to_x(q)[in_x], problem.lower[in_x], problem.upper[in_x]
+            distances = np.where(low < high, np.minimum(x - low, high - x), np.inf)
+            if np.isfinite(distances).any():
+                k = int(distances.argmin())
+                yield Room(float(distances[k]), f"joint {problem.robot.tangent_names[in_v[k]]}", self.name)
+            for clearance in problem.constraints:
+                if isinstance(clearance, Clearance):
+                    name, distance = clearance.closest(numeric.at(q))
+                    yield Room(distance, name, self.name)

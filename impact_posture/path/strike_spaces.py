@@ -1,0 +1,85 @@
+"""The constraints of a strike, for the motions before and after the impact."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.impact.impact_contact import point_on
+from impact_posture.impact.worst_case.worst_normal import cone_axes
+from impact_posture.path.path_space import PathSpace
+from impact_posture.posture.constraints.clearance import Clearance
+from impact_posture.posture.constraints.pose_constraints import (
+    AxisInCone,
+    HeldOrientation,
+    HeldPose,
+    HeldPosition,
+    HeldTurn,
+    PositionAlong,
+)
+from impact_posture.posture.program.constrained_problem import ConstrainedProblem, equality_jacobian
+from impact_posture.system.arrays import Array
+
+_POSES = (HeldPose, HeldPosition, HeldOrientation, AxisInCone)
+
+
+class StrikeSpaces:
+    """The constraints of a strike at a posture ``q``, shape (nq,), for the motions before and after the impact.
+
+    The surface stays where it is at ``q``.  The contact point may not enter it.
+
+    Attributes:
+        normal: Normal of the surface at ``q``, world axes, shape (3,).
+        approach: Postures on the way to the run-up.  The orientation of the contact frame is held as at the optimum.
+        run_up: Postures of the run-up.  In addition, the contact point is on the normal through its place at ``q``.
+        rebound: Postures after the impact, which moves all frames except the feet.
+
+    Args:
+        turns: Whether the contact frame may turn in the run-up.
+        normal: Unit normal that replaces the normal of the contact, world axes, shape (3,).
+    """
+
+    def __init__(
+        self, problem: ConstrainedProblem, q: Array, *, turns: bool = False, normal: Array | None = None
+    ) -> None:
+        (contact,), numeric = problem.objective.contacts, Numeric(problem.robot.model).at(q)
+        self._point = point_on(problem.robot, contact.frame, contact.offset)
+        at, n = numeric.placement(self._point), np.array(contact.normal)
+        self.normal = np.asarray(at.rotation @ n) if contact.normal_frame == "contact" else n
+        self.normal = self.normal if normal is None else normal
+        tangents = cone_axes(self.normal)[:, 1:].T
+        first = len(problem.objective.supports)
+        # The constraint on the position comes first.  A constraint on the tilt may follow.
+        count = 2 if problem.requirements.contact_pose.startswith("aligned:") else 1
+        position, *tilt = problem.constraints[first : first + count]
+        turned = [] if turns else [position.orientation, *tilt] if isinstance(position, HeldPose) else tilt
+        still = {} if problem.surroundings is None else {
+            c.name: c for c in problem.surroundings.fixed_at(q).constraints
+        }  # fmt: skip
+        rest = [
+            still[c.name] if isinstance(c, Clearance) else c
+            for k, c in enumerate(problem.constraints)
+            if not (first <= k < first + count or c.at_impact)
+        ]
+        contact_at = self._point, at.translation
+        above = PositionAlong("contact above the surface", *contact_at, self.normal[None], 0.0, np.inf)
+        line = PositionAlong("contact on the normal", *contact_at, tangents, 0.0, 0.0)
+        poses = _POSES if first else (*_POSES, HeldTurn)
+        struck = [c for k, c in enumerate(rest) if k < first or not isinstance(c, poses)]
+        self.approach, self.run_up, self.rebound = (
+            PathSpace(replace(problem, constraints=(*constraints, above), rows=()))
+            for constraints in ([*rest, *turned], [*rest, *turned, line], struck)
+        )
+
+    def contact_velocity(self, model: Numeric, velocity: Array) -> Array:
+        """Return the velocity of the contact point, world axes, shape (3,)."""
+        return np.asarray(model.jacobian(self._point)[:3] @ velocity)
+
+    def rows(self, space: PathSpace) -> Callable[[Numeric], Array]:
+        """Return a function for the matrix ``(J_equalities; nᵀJ)`` of a space, shape (m, nv)."""
+        return lambda model: np.vstack(
+            [equality_jacobian(space.problem, model), self.normal @ model.jacobian(self._point)[:3]]
+        )
