@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from impact_posture.codegen.impact_gradient import ImpactGradient
-from impact_posture.errors import InputError
+from impact_posture.errors import InputError, SpecError
 from impact_posture.system.optional_package import import_extra
 
 if TYPE_CHECKING:
@@ -49,9 +49,9 @@ def load(
 class BatchMetric:
     """``H`` and the objective of an export, with gradients, for many configurations.
 
-    The results are arrays of the package, number type and device of ``q``.  If ``q`` is on the CPU, the C code
-    computes the rows on all cores.  If ``q`` is on an NVIDIA GPU, the CUDA code computes the rows there.  The rows of
-    a configuration that fails are NaN.
+    The results are arrays of the package, floating-point type and device of ``q``.  If ``q`` is on the CPU, the C
+    code computes the rows on all cores.  If ``q`` is on an NVIDIA GPU, the CUDA code computes the rows there.  The
+    rows of a configuration that fails are NaN.
 
     By default, gradients are **tangent** gradients, shape (N, nv): entry i is the derivative along ``ν_i``.  For a
     floating base, the first six entries are for the linear and angular velocity in base axes.  With ``in_q``,
@@ -66,8 +66,12 @@ class BatchMetric:
     def __init__(self, gradient: ImpactGradient, folder: Path) -> None:
         """Use a loaded export; ``folder`` contains its CUDA code, if there is any."""
         self.gradient, self._folder = gradient, folder
-        self._joints = tuple(_joints(gradient.manifest["q_names"]))
-        self._kernels: dict[str, Any] = {}
+        names, prefix = gradient.manifest.get("q_names"), gradient.manifest["prefix"]
+        if names is None:
+            # An earlier version wrote this export.
+            raise SpecError("does not name the entries of q", where=f"{prefix}.json", hint="run codegen again")
+        self._joints = tuple(_joints(names))
+        self._kernels: dict[tuple[str, int], Any] = {}
 
     def value_and_gradient(self, q: Any, n: Any, *, in_q: bool = False) -> tuple[Any, Any]:
         """Return ``H``, shape (N,), and its gradients for configurations ``q``, shape (N, nq).
@@ -92,7 +96,8 @@ class BatchMetric:
     def _call(self, name: str, q: Any, n: Any, in_q: bool) -> tuple[Any, Any]:
         package, on_gpu = _package(q), _on_gpu(q)
         xp = import_extra("cupy", "cuda", "CuPy") if on_gpu else np
-        with xp.cuda.Device(q.__dlpack_device__()[1]) if on_gpu else nullcontext():
+        device = q.__dlpack_device__()[1] if on_gpu else 0
+        with xp.cuda.Device(device) if on_gpu else nullcontext():
             given = _to(xp, q)
             rows = xp.ascontiguousarray(given, dtype=self.gradient.dtype)
             if rows.ndim != 2 or rows.shape[1] != self.gradient.nq:
@@ -101,10 +106,11 @@ class BatchMetric:
             if in_q:
                 rows, scales = self._normalized(xp, rows)
             inputs = (rows,) if n is None else (rows, xp.asarray(_to(xp, n), dtype=self.gradient.dtype))
-            value, grad = self._launch(xp, name, *inputs) if on_gpu else self._on_cores(name, *inputs)
+            value, grad = self._launch(xp, (name, device), *inputs) if on_gpu else self._on_cores(name, *inputs)
             if in_q:
                 grad = self._in_coordinates(xp, rows, scales, grad)
-            results = [array.astype(given.dtype, copy=False) for array in (value, grad)]
+            kept = given.dtype if given.dtype.kind == "f" else self.gradient.dtype
+            results = [array.astype(kept, copy=False) for array in (value, grad)]
             value, grad = results if package is xp else map(package.from_dlpack, results)
         return value, grad
 
@@ -112,16 +118,16 @@ class BatchMetric:
         call = self.gradient.objective_batch if name == "objective" else self.gradient.value_and_gradient_batch
         return call(*inputs, threads=len(os.sched_getaffinity(0)))
 
-    def _launch(self, cupy: Any, name: str, q: Any, n: Any = None) -> tuple[Any, Any]:
-        """Run the CUDA kernel of the function ``name``; inputs and results are arrays of CuPy."""
-        if (kernel := self._kernels.get(name)) is None:
+    def _launch(self, cupy: Any, key: tuple[str, int], q: Any, n: Any = None) -> tuple[Any, Any]:
+        """Run a CUDA kernel; ``key`` is the name of its function and the number of the current GPU."""
+        if (kernel := self._kernels.get(key)) is None:
             header = self._folder / f"{self.gradient.manifest['prefix']}.cuh"
             if not header.is_file():
                 raise InputError("has no CUDA code", where=str(self._folder), hint="export it with `cuda`")
-            expression = f"{self.gradient.symbols[name]}_kernel<{_THREADS}>"
+            expression = f"{self.gradient.symbols[key[0]]}_kernel<{_THREADS}>"
             code, options = header.read_text(encoding="utf-8"), ("-std=c++17",)
             module = cupy.RawModule(code=code, options=options, backend="nvrtc", name_expressions=(expression,))
-            kernel = self._kernels[name] = module.get_function(expression)
+            kernel = self._kernels[key] = module.get_function(expression)
         count, normals = len(q), list[Any]()
         if n is not None:
             if n.shape not in ((3,), (count, 3)):
@@ -145,10 +151,11 @@ class BatchMetric:
     def _in_coordinates(self, xp: Any, q: Any, scales: Any, tangent: Any) -> Any:
         """Return the gradients of ``H(u(q))``, shape (N, nq), from tangent gradients and ``u(q)``."""
         grad = xp.empty_like(q)
-        plain = np.ones(self.gradient.nq, dtype=bool), np.ones(self.gradient.nv, dtype=bool)
+        plain = set(range(self.gradient.nq)), set(range(self.gradient.nv))
         for names, at, speed in self._joints:
             last, size = at + len(names), _JOINTS[names]
-            plain[0][at:last], plain[1][speed : speed + size] = False, False
+            plain[0].difference_update(range(at, last))
+            plain[1].difference_update(range(speed, speed + size))
             g = tangent[:, speed : speed + size]
             if "qw" in names:
                 # With the vector part r and the scalar part w, q̇ = ½(wω + r×ω, −rᵀω) and R v = v + 2 r×(wv + r×v).
@@ -162,7 +169,8 @@ class BatchMetric:
             grad[:, last - 2], grad[:, last - 1] = -s * g[:, -1], c * g[:, -1]
             if size == 3:
                 grad[:, at], grad[:, at + 1] = c * g[:, 0] - s * g[:, 1], s * g[:, 0] + c * g[:, 1]
-        grad[:, plain[0]] = tangent[:, plain[1]]
+        to, source = (xp.asarray(sorted(entries), dtype=int) for entries in plain)
+        grad[:, to] = tangent[:, source]
         return grad * scales
 
 

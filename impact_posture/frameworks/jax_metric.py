@@ -41,7 +41,7 @@ class JaxMetric:
     def __init__(self, batch: gpu.BatchMetric) -> None:
         """Make the functions of a batch differentiable."""
         self.batch, self._jax = batch, import_extra("jax")
-        self._H, self._objective = self._differentiable(), self._differentiable()
+        self._function = self._differentiable()
 
     def __call__(self, q: Any, n: Any) -> Any:
         """Return ``H`` for the unit normal ``n``, shape (3,) or (…, 3).
@@ -51,13 +51,14 @@ class JaxMetric:
         """
         numpy = self._jax.numpy
         q = numpy.asarray(q)
-        return self._H(q, numpy.broadcast_to(numpy.asarray(n, dtype=q.dtype), (*q.shape[:-1], 3)))
+        return self._function(q, numpy.broadcast_to(numpy.asarray(n, dtype=q.dtype), (*q.shape[:-1], 3)))
 
     def objective(self, q: Any) -> Any:
         """Return the objective of the export, such as the effective mass."""
-        return self._objective(self._jax.numpy.asarray(q))
+        return self._function(self._jax.numpy.asarray(q))
 
     def _differentiable(self) -> Any:
+        """Return the function of ``q`` and ``n`` that returns ``H``, or of ``q`` that returns the objective."""
         jax = self._jax
 
         def on_host(q: Any, *n: Any) -> tuple[Any, Any]:

@@ -16,7 +16,7 @@ import pytest
 import impact_posture as ip
 from impact_posture.codegen.export import Export, write_export
 from impact_posture.codegen.self_test import sample_postures
-from impact_posture.errors import InputError
+from impact_posture.errors import InputError, SpecError
 from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from tests.codegen.test_cuda import on_host
@@ -81,6 +81,8 @@ def test_batches_equal_single_calls_on_all_threads(sample: Sample, monkeypatch: 
     assert np.isnan(metric.objective(broken)[0]).tolist() == [False, True, False]
     with pytest.raises(InputError, match="q: has shape"):
         metric.objective(sample.q[0])
+    whole = [[0] * 6 + [1] + [0] * 2 + [1, 0] + [1, 0] + [0]]
+    assert metric.objective(whole)[0].dtype == float
     half, _ = metric.value_and_gradient(sample.q[:2].astype(np.float32) * 1.0, N)
     assert half.dtype == np.float32
 
@@ -160,6 +162,13 @@ def test_arrays_on_a_gpu_call_the_kernels(sample: Sample, monkeypatch: pytest.Mo
     with pytest.raises(InputError, match="export it with"):
         ip.gpu.load(sample.out).objective(as_gpu(sample.q))
     (sample.out / "hidden").rename(sample.out / "small.cuh")
+
+
+def test_exports_of_earlier_versions_do_not_name_the_entries_of_q(sample: Sample) -> None:
+    gradient = ip.gpu.load(sample.out).gradient
+    gradient.manifest = {key: value for key, value in gradient.manifest.items() if key != "q_names"}
+    with pytest.raises(SpecError, match="run codegen again"):
+        ip.gpu.BatchMetric(gradient, sample.out)
 
 
 def test_absent_packages_are_named(sample: Sample, monkeypatch: pytest.MonkeyPatch) -> None:
