@@ -21,6 +21,8 @@ _LEAST_MEMORY = 1 << 30
 def prepare() -> None:
     """Set up streams, environment and signals.  Only the entry point calls this, because it changes the process."""
     _open_streams()
+    # With an umask such as 777, the program could neither read nor remove its own files.
+    os.umask(os.umask(0o077) & 0o077)
     # Always use the file backend, because a notebook backend or a missing backend in the environment would fail.
     os.environ["MPLBACKEND"] = "agg"
     # Rich makes lines of this width, which fill the memory if it is huge, and are empty if it is zero.

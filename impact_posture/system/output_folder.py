@@ -58,6 +58,11 @@ def check_output(out: Path, *, force: bool, kind: Kind) -> None:
             edited = f", and it holds changes of yours in {listed(changed, _SHOWN)}" if changed else ""
             raise OutputError(f"exists{edited}", where=str(out), hint=_EXISTS)
         _check_ours(out, kind)
+        # Another user can own the folder in a parent folder that everyone may write to.
+        if not os.access(out, os.W_OK | os.X_OK):
+            raise OutputError(
+                "cannot be replaced, because its files cannot be deleted", where=str(out), hint="choose another `out`"
+            )
     parent = next(folder for folder in out.absolute().parents if folder.exists())
     if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
         raise OutputError("cannot be written", where=str(parent), hint="choose another `out`")

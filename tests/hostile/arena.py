@@ -98,18 +98,18 @@ def judging() -> Iterator[Callable[..., None]]:
     assert not failures, f"{len(failures)} of {TALLY.tried - before}:\n" + "\n".join(failures)
 
 
-def strike(folder: Path, *argv: str) -> Outcome:
-    """Run and count a command line in a folder, and return the outcome."""
+def strike(folder: Path, *argv: str, before: Callable[[], None] | None = None) -> Outcome:
+    """Run and count a command line in a folder, and return the outcome.  The process first calls ``before``."""
     TALLY.tried += 1
-    return _strike(folder, argv)
+    return _strike(folder, argv, before)
 
 
-def _strike(folder: Path, argv: tuple[str, ...]) -> Outcome:
+def _strike(folder: Path, argv: tuple[str, ...], prepare: Callable[[], None] | None = None) -> Outcome:
     before = _content(folder)
     streams = [os.memfd_create(name) for name in ("out", "err")]
     child = os.fork()
     if child == 0:
-        _become(folder, argv, streams)
+        _become(folder, argv, streams, prepare)
     status = _wait(child)
     texts = []
     for stream in streams:
@@ -136,7 +136,7 @@ def attack(
     return outcomes
 
 
-def _become(folder: Path, argv: tuple[str, ...], streams: list[int]) -> None:
+def _become(folder: Path, argv: tuple[str, ...], streams: list[int], prepare: Callable[[], None] | None) -> None:
     code = 70
     try:
         gc.freeze()
@@ -147,6 +147,8 @@ def _become(folder: Path, argv: tuple[str, ...], streams: list[int]) -> None:
             os.dup2(stream, number)
         sys.stdout, sys.stderr = (io.TextIOWrapper(os.fdopen(n, "wb", closefd=False)) for n in (1, 2))
         sys.argv = ["impact-posture", *argv]
+        if prepare is not None:
+            prepare()
         code = run(PARSER, put_right(argv))
         for file in (sys.stdout, sys.stderr):
             file.flush()
