@@ -18,6 +18,7 @@ from impact_posture.posture.analysis.result_document import SCHEMA
 from impact_posture.posture.formulation.problem_file import Prepared, prepare, read_settings
 from impact_posture.posture.manifold.null_space_path import NullSpacePath
 from impact_posture.posture.search.global_search import SelfMotionMap
+from impact_posture.robot.model_joints import rigid_groups
 from impact_posture.system.arrays import Array
 from impact_posture.system.npz_files import read_arrays
 from impact_posture.system.text_files import read_text
@@ -146,13 +147,18 @@ def result_view(prepared: Prepared, postures: SolvedPostures, motion: PosturePat
 
 
 def _collisions(prepared: Prepared, *postures: Array) -> Any:
-    """Return the colliding shapes at each posture.  With surroundings, the optimization excludes collisions."""
-    if prepared.problem.surroundings is not None:
+    """Return the colliding shapes at each posture, without shapes that held joints fix to each other.
+
+    With surroundings, the optimization excludes collisions.
+    """
+    problem = prepared.problem
+    if problem.surroundings is not None:
         return (), ()
     from impact_posture.collision.mesh_check import MeshCheck
     from impact_posture.collision.robot_shapes import load_shapes
 
-    check = MeshCheck(prepared.impact.robot, load_shapes(prepared.impact.robot))
+    robot = prepared.impact.robot
+    check = MeshCheck(robot, load_shapes(robot), rigid_groups(robot.model, problem.requirements.hold))
     return tuple(check.collisions(q) for q in postures)
 
 

@@ -13,9 +13,10 @@ from impact_posture.collision.robot_shapes import RobotShapes, load_shapes
 from impact_posture.config.problem_settings import ProblemSettings
 from impact_posture.config.table_validation import validate
 from impact_posture.dynamics.numeric import Numeric
+from impact_posture.output.result_reader import _collisions as drawn_collisions
 from impact_posture.posture.approach.attainable_speed import AttainableSpeed
 from impact_posture.posture.constraints.requirements import Requirements
-from impact_posture.posture.formulation.problem_file import prepare
+from impact_posture.posture.formulation.problem_file import Prepared, prepare
 from impact_posture.posture.manifold.feasible_start import feasible_start
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem
 from impact_posture.posture.search.growing_search import feasible
@@ -28,10 +29,13 @@ TIP = (link("tip"), joint("tip_mount", "palm tip", None, "0.1 0 0", "fixed", "")
 BENT = "[postures.bent]\njoints = { a = -0.9, b = 1.2, c = 0.5 }\n"
 
 
-def posed(folder: Path, *elements: str, toml: str = BENT, **settings: Any) -> ConstrainedProblem:
-    path = write(folder, *elements, toml=toml)
+def prepared(path: Path, **settings: Any) -> Prepared:
     values = {"robot": str(path), "frame": "tip", "normal": (0.0, 0.0, 1.0), "contact_pose": "position"}
-    return prepare(validate(ProblemSettings, {**values, **settings}, "options")).problem
+    return prepare(validate(ProblemSettings, {**values, **settings}, "options"))
+
+
+def posed(folder: Path, *elements: str, toml: str = BENT, **settings: Any) -> ConstrainedProblem:
+    return prepared(write(folder, *elements, toml=toml), **settings).problem
 
 
 def test_joints_whose_torque_is_not_checked_are_named(tmp_path: Path) -> None:
@@ -98,6 +102,14 @@ def test_held_fingers_may_touch(tmp_path: Path, gap: float, noted: bool) -> None
     assert "self-collision" not in [c.name for c in problem.constraints]
     assert problem.surroundings is not None and not problem.surroundings.collisions(problem.given)
     assert feasible(problem, problem.given)
+
+
+@pytest.mark.parametrize("hold", [(), ("left_joint", "right_joint")])
+def test_pictures_show_no_collision_of_held_fingers(tmp_path: Path, hold: tuple[str, ...]) -> None:
+    """The problem does not check collisions, so the pictures do."""
+    q = gripper(tmp_path, -0.0004, hold=("left_joint", "right_joint")).given
+    unchecked = prepared(tmp_path / "written.urdf", hold=hold, collision=False)
+    assert drawn_collisions(unchecked, q) == ([] if hold else [("left", "right")],)
 
 
 def test_fingers_that_move_are_kept_apart(tmp_path: Path) -> None:
