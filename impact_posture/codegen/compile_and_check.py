@@ -35,6 +35,7 @@ from impact_posture.system.libraries import (
     source_key,
 )
 from impact_posture.system.scratch_folder import scratch_folder
+from impact_posture.system.text_files import read_text
 from impact_posture.system.toolchain import find_compiler, words_of
 
 # Relative tolerance for the comparison with :class:`ImpactOracle`.  With supports of compliance ε, the condition
@@ -94,7 +95,7 @@ def _cached_library(export_dir: Path, prefix: str) -> Path | None:
     Return ``None`` if the cache is not writable.  Compiling the code of a humanoid takes seconds, and many exports
     differ only in the constant posture.
     """
-    source = (export_dir / f"{prefix}.c").read_text(encoding="utf-8")
+    source = read_text(export_dir / f"{prefix}.c")
     content = [re.sub(rf"^const \w+ {prefix}_(posture|manifest)\[.*?;$", "", source, flags=re.DOTALL | re.MULTILINE)]
     content += [platform.machine(), *(find_compiler() or ()), *words_of("CFLAGS")]
     try:

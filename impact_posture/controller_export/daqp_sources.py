@@ -17,7 +17,7 @@ from pathlib import Path
 
 from impact_posture.errors import InputError
 from impact_posture.system.libraries import building, cache_folder, is_cached
-from impact_posture.system.text_files import read_bytes
+from impact_posture.system.text_files import open_regular, read_bytes
 
 VERSION = "0.11.0"
 SOURCES = ("auxiliary.c", "daqp.c", "factorization.c")
@@ -64,7 +64,7 @@ def daqp_sources(folder: Path | None = None) -> dict[str, bytes]:
         with building(archive) as place:
             _download(place)
     try:
-        with tarfile.open(archive) as tar:
+        with open_regular(archive) as file, tarfile.open(fileobj=file) as tar:
             return _checked(lambda name: _from_archive(tar, name), str(archive), again)
     except (OSError, EOFError, tarfile.TarError) as error:
         raise InputError.unreadable(archive, error, again) from None

@@ -18,6 +18,7 @@ import numpy as np
 from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.errors import InputError, SpecError
 from impact_posture.system.optional_package import import_extra
+from impact_posture.system.text_files import read_text
 
 if TYPE_CHECKING:
     from impact_posture.robot.robot import Robot
@@ -125,7 +126,7 @@ class BatchMetric:
             if not header.is_file():
                 raise InputError("has no CUDA code", where=str(self._folder), hint="export it with `cuda`")
             expression = f"{self.gradient.symbols[key[0]]}_kernel<{_THREADS}>"
-            code, options = header.read_text(encoding="utf-8"), ("-std=c++17",)
+            code, options = read_text(header), ("-std=c++17",)
             module = cupy.RawModule(code=code, options=options, backend="nvrtc", name_expressions=(expression,))
             kernel = self._kernels[key] = module.get_function(expression)
         count, normals = len(q), list[Any]()

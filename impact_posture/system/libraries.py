@@ -49,6 +49,7 @@ def build_library(folder: Path, prefix: str, library: Path | None = None, flags:
     """
     compiler = require_compiler("codegen")
     library = (library_path(folder, prefix) if library is None else library).absolute()
+    _check_sources(folder)
     with building(library) as scratch:
         output = str(scratch / library.name)
         run_compiler(
@@ -72,6 +73,7 @@ def build_parts(folder: Path, library: Path, parts: Mapping[str, Sequence[str]])
     """
     compiler = require_compiler("codegen")
     library = library.absolute()
+    _check_sources(folder)
     cached = cache_folder("objects")
     with building(library) as scratch:
         commands = [[*compiler, *_FLAGS, *words_of("CFLAGS"), *flags, name] for name, flags in parts.items()]
@@ -88,6 +90,15 @@ def build_parts(folder: Path, library: Path, parts: Mapping[str, Sequence[str]])
         run_compiler([*compiler, "-shared", *map(str, objects), "-o", str(scratch / library.name), "-lm"], folder)
         _check_sanitizer(scratch / library.name)
     return library
+
+
+def _check_sources(folder: Path) -> None:
+    """Raise an error if a source or header is a pipe, for which the compiler would wait forever."""
+    for path in folder.glob("*.[ch]"):
+        try:
+            open_regular(path).close()
+        except OSError as error:
+            raise CompilerError.unreadable(path, error) from None
 
 
 @contextmanager

@@ -115,11 +115,13 @@ def test_a_text_of_a_xacro_file_that_fills_the_memory(arena: Path, monkeypatch: 
     assert "a.xacro" in outcome.err and "memory" in outcome.err.lower()
 
 
-@pytest.mark.parametrize("name", ["small.json", "libsmall.so.sha256"])
+@pytest.mark.parametrize("name", ["small.json", "small.h", "libsmall.so.sha256"])
 def test_pipes_in_an_export(name: str, arena: Path) -> None:
     outcome = strike(arena, "codegen", "small.urdf", *PUSH, "--prefix", "small", "--compile", "--out", "c", "--quiet")
     assert (outcome.code, outcome.complaints) == (0, []), outcome.err
     (arena / "c" / name).unlink()
     os.mkfifo(arena / "c" / name)
+    if name == "small.h":
+        (arena / "c" / "libsmall.so").unlink()
     with pytest.raises(InputError, match="pipe or a device"):
         _ = ImpactGradient.load(arena / "c" / "small.json").objective

@@ -23,7 +23,7 @@ from impact_posture.robot.robot import Robot
 from impact_posture.robot.urdf import example_robot_data
 from impact_posture.system.arrays import Array
 from impact_posture.system.libraries import source_key
-from impact_posture.system.text_files import open_regular
+from impact_posture.system.text_files import open_regular, read_bytes
 
 # Maximum number of triangles of all meshes on a page.  This maximum limits the size of the page, and the time to draw
 # the robot without a GPU.
@@ -248,7 +248,7 @@ def license_of(mesh: Path | None) -> MeshLicense | None:
 def _read_license(folder: Path) -> MeshLicense:
     """Read README.md (lines ``license:`` and ``upstream:``) and LICENSE of a package."""
     readme, text = (
-        path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
+        read_bytes(path).decode(errors="replace") if path.is_file() else ""
         for path in (folder / "README.md", folder / "LICENSE")
     )
     matches = (re.search(rf"^{key}:\s*(\S.*)$", readme, re.I | re.M) for key in ("license", "upstream"))
