@@ -16,7 +16,6 @@ import pinocchio as pin
 
 from impact_posture.collision.shape_corners import Triangles, mesh_points, mesh_triangles, renumbered
 from impact_posture.config.cached_values import do_not_store
-from impact_posture.robot.urdf import quiet_stderr
 from impact_posture.system.arrays import Array
 from impact_posture.system.isolated_calls import CallFailed, isolated_calls
 from impact_posture.system.text_files import open_regular, read_bytes
@@ -102,10 +101,9 @@ def _stamp(path: Path) -> _Stamp:
 def _parsed(stamp: _Stamp) -> Mesh:
     path = stamp[0]
     transform, unit = _root_transform(path), _unit(path)
-    with quiet_stderr():
-        # Use a new loader every time, because a loader keeps all meshes in memory.  The volumes are not used, and
-        # BV_AABB volumes are made fastest.
-        shape = coal.MeshLoader(coal.BV_AABB).load(str(path), np.ones(3))
+    # Use a new loader every time, because a loader keeps all meshes in memory.  The volumes are not used, and BV_AABB
+    # volumes are made fastest.
+    shape = coal.MeshLoader(coal.BV_AABB).load(str(path), np.ones(3))
     points, triangles = mesh_points(shape), mesh_triangles(shape)
     if len(points) > max(_MOST_VERTICES, stamp[1]):
         raise UnusableShape(f"{path} repeats its parts to {len(points)} vertices; simplify the mesh")

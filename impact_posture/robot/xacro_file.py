@@ -6,11 +6,10 @@ Expanding a file evaluates the Python expressions in it, so expand only files th
 from __future__ import annotations
 
 import hashlib
-import io
 import sys
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, redirect_stderr, suppress
+from contextlib import contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -127,13 +126,13 @@ def _expanded(path: Path, values: _Arguments, packages: _Packages) -> tuple[str,
     """Return the text of the URDF, and the names of the arguments that the file knows."""
     xacro = import_extra("xacro", "robots")
     try:
-        with packages.indexed(), redirect_stderr(io.StringIO()):  # xacro prints the place of an error.
+        with packages.indexed():
             return xacro.process_file(str(path), mappings=values).toxml(), values.known
     except Exception as error:  # Expressions raise any error.
         cause = error
         while isinstance(cause, xacro.XacroException) and isinstance(cause.exc, Exception):
             cause = cause.exc
-        if isinstance(cause, InputError):
+        if isinstance(cause, InputError | MemoryError):
             raise cause from None
         if isinstance(cause, OSError):
             raise UrdfError.unreadable(Path(cause.filename or path), cause) from None

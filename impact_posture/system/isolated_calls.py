@@ -43,9 +43,9 @@ def isolated_calls(
 ) -> Iterator[_Result | Exception]:
     """Yield ``function(item)`` for each item, or the exception of the call.
 
-    The calls run one after the other in a copy of this process.  If a call ends the copy, a new copy continues with
-    the next item.  A call may use ``seconds(item)`` of processor time, and all calls :data:`MOST_MEMORY`.  The
-    signal handlers of this process run while a call waits for a file.
+    The calls run one after the other in a copy of this process, and their error output is discarded.  If a call ends
+    the copy, a new copy continues with the next item.  A call may use ``seconds(item)`` of processor time, and all
+    calls :data:`MOST_MEMORY`.  The signal handlers of this process run while a call waits for a file.
 
     Raises:
         ImpactPostureError: The system cannot start a process.
@@ -55,7 +55,9 @@ def isolated_calls(
         return
 
     def outcomes() -> Iterator[_Outcome[_Result]]:
-        faulthandler.disable()  # This process reports a crash of the copy.
+        # This process reports the errors of the copy.
+        faulthandler.disable()
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
         _limit(resource.RLIMIT_CORE, 0)
         if before := _memory():
             _limit(resource.RLIMIT_AS, before + MOST_MEMORY)

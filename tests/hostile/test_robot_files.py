@@ -24,6 +24,7 @@ ARM = (
 )  # fmt: skip
 MIMIC = '<joint name="elbow" type="revolute"><mimic joint="shoulder" multiplier="1e200"/>'
 MESH = '<asset><mesh name="m" file="pipe.stl"/></asset></mujoco>'
+FLAT = '<asset><mesh name="m" vertex="0 0 0 1 0 0 0 1e38 0 0 0 1"/></asset><worldbody><geom type="mesh" mesh="m"/>'
 FIELD = '<asset><hfield name="h" nrow="100000" ncol="100000" size="1 1 1 1"/></asset></mujoco>'
 FAULTS = {
     "name of the world": ("elbow", "universe", "two joints have the name 'universe'"),
@@ -37,6 +38,7 @@ FAULTS = {
     "bodies": ("</worldbody>", "<body/>" * 100_000 + "</worldbody>", "more than 5000 bodies"),
     "repetitions": ("<site", '<replicate count="1000000"><geom size=".1"/></replicate><site', "repetitions"),
     "mesh": ("</mujoco>", MESH, "'pipe.stl' is not a file"),
+    "flat mesh": ("<worldbody>", FLAT, "MuJoCo refuses it"),
     "height field": ("</mujoco>", FIELD, "rows or columns"),
 }
 
