@@ -23,7 +23,7 @@ Controller = Annotated[
     options.option(
         "--controller", RUN,
         "nominal, robust, robust-speed, robust-sticking, robust-release, robust-flow, robust-flow-sticking, "
-        "posture, posture-sticking, path, stiff, posture-stiff, invariant, walker, reference-spreading, "
+        "posture, posture-sticking, path, strike, stiff, posture-stiff, invariant, walker, reference-spreading, "
         "impact-aware, or the name that an installed package has registered.",
     ),
 ]  # fmt: skip

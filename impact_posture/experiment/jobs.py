@@ -144,7 +144,7 @@ def execute(job: Job, factory: ControllerFactory | None = None) -> tuple[tuple[R
         "prediction": prediction,
         "runs": parts,
         "offline": None if offline is None else offline.to_dict(),
-        "path": factory.path.to_dict() if job.controller.removesuffix("-stiff") == "path" else None,
+        "path": None if (path := factory.path_of(job.controller)) is None else path.to_dict(),
         "warnings": warnings,
         "model_sha256": factory.setup.robot.model_sha256,
         "versions": software(),

@@ -22,7 +22,8 @@ class ActuatorLimits:
     Motors, rotors and feet carry the load as in :class:`~impact_posture.posture.loads.equilibrium.Equilibrium`.
     The feet stay where they are at the posture ``q``, shape (nq,).  ``requirements`` contains the friction.
     ``names`` and ``kinds`` are the names and types (``torque`` or ``thrust``) of the actuators with limits.
-    ``missing`` is the reason why limits of the robot are unknown; empty if all are known.
+    ``rotors`` states whether the robot flies with rotors.  ``missing`` is the reason why limits of the robot are
+    unknown; empty if all are known.
     """
 
     def __init__(self, objective: Objective, q: Array, requirements: Requirements) -> None:
@@ -31,6 +32,7 @@ class ActuatorLimits:
         # Motor rotors turn with their joints during a motion, so the armature counts in every joint model.
         self._model.armature = np.where(np.isfinite(robot.armature), robot.armature, 0.0)
         self._data = self._model.createData()
+        self.rotors = bool(robot.floating and robot.spec.propulsion)
         loads = load_cases(objective, q, replace(requirements, hold_force=0.0))
         self.missing = loads.unknown
         self.names: tuple[str, ...] = ()

@@ -214,29 +214,37 @@ def _struck(
             break
         most = f"at {run.strike.speed:.3g} m/s at most, because of {run.strike.hindrance}"
         first = first or f"the optimum can be struck {most}"
+    blocked = ""
     for k, run in sorted(runs, key=lambda each: -each[1].strike.speed):
         before, begin = run.spaces.approach, run.motion.rows.q[0]
-        if fault := _fault(before, start):
-            first = first or fault
+        # The surface at the optimum can be nearer than the contact point at the start, which then has to leave it.
+        here = start if before.valid(start) else before.pulled(start)
+        if here is None:
+            blocked = blocked or _fault(before, start)
             continue
-        connection = connect(before, start, begin, seed, effort)
+        connection = connect(before, here, begin, seed, effort)
         if connection.path is None:
-            first = first or "no path to the begin of the run-up was found"
+            blocked = blocked or "no path to the begin of the run-up was found"
             continue
         motion, strike = run.motion, run.strike
         if before.length(connection.path) > _NO_MOTION:
             there = _timed(before, connection.path, limits, seed)
             if there is None:
-                first = first or _NOT_SMOOTH
+                blocked = blocked or _NOT_SMOOTH
                 continue
             shift = float(there.rows.t[-1])
             motion = TimedCurve(there.rows.followed_by(motion.rows), there.method, (*there.notes, *motion.notes))
             strike = replace(strike, run_up_s=shift, contact_s=float(motion.rows.t[-1]))
         after = follow_through(solution.problem, motion.rows.q[-1], strike.velocity, restitution, limits)
         strike = replace(strike, follow_through=after)
-        failure = f"{first}; the path ends at optimum number {k + 1} of {len(solution.optima)}" if k else ""
-        return _finished(before, motion, connection.method, limits, failure, strike=strike)
-    return first or "no optimum can be struck"
+        failure = (
+            f"{first or blocked}; the path ends at optimum number {k + 1} of {len(solution.optima)}" if k else ""
+        )
+        moved = before.distance(start, here)
+        note = f"the path begins {moved:.2g} (rad, m) from the start, so that the contact is above the surface"
+        notes = [note] if moved > _NO_MOTION else []
+        return _finished(before, motion, connection.method, limits, failure, *notes, strike=strike)
+    return blocked or first or "no optimum can be struck"
 
 
 def _still(space: PathSpace, objective: Objective, q: Array, failure: str, *notes: str) -> PosturePath:

@@ -23,6 +23,8 @@ from impact_posture.posture.constraints.pose_constraints import (
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem, equality_jacobian
 from impact_posture.system.arrays import Array
 
+# After the impact, the contact point may be this far inside the surface, m, because it may slide along the surface.
+_PRESSED = 1e-4
 _POSES = (HeldPose, HeldPosition, HeldOrientation, AxisInCone)
 
 
@@ -69,9 +71,10 @@ class StrikeSpaces:
         line = PositionAlong("contact on the normal", *contact_at, tangents, 0.0, 0.0)
         poses = _POSES if first else (*_POSES, HeldTurn)
         struck = [c for k, c in enumerate(rest) if k < first or not isinstance(c, poses)]
+        pressed = PositionAlong(above.name, *contact_at, self.normal[None], -_PRESSED, np.inf)
         self.approach, self.run_up, self.rebound = (
-            PathSpace(replace(problem, constraints=(*constraints, above), rows=()))
-            for constraints in ([*rest, *turned], [*rest, *turned, line], struck)
+            PathSpace(replace(problem, constraints=tuple(constraints), rows=()))
+            for constraints in ([*rest, *turned, above], [*rest, *turned, above, line], [*struck, pressed])
         )
 
     def contact_velocity(self, model: Numeric, velocity: Array) -> Array:

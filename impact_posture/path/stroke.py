@@ -20,6 +20,8 @@ from impact_posture.system.arrays import Array
 _SHORT, _LONG = 0.1, 0.5
 # Tangent length between two knots of a stroke, and largest tangent length, rad mixed with m.
 _KNOTS, _FARTHEST = STEP / 2, 1.5
+# Smallest tangent speed that counts, rad/s mixed with m/s.
+_AT_REST = 1e-9
 # Least number of knots, and how often the length of a curve is halved until its knots suffice.
 _LEAST, _HALVINGS = 8, 3
 # A stroke ends where its velocity exceeds this multiple of the velocity at its posture.
@@ -28,14 +30,15 @@ _FASTER = 3.0
 _DEFLECTED = 0.01
 # Singular values below this share of the largest one are zero.
 _RANK = 1e-9
-# Shortest duration of a stroke, s, which a controller can follow.  Ratio of successive trial durations, and number of
-# bisections between two of them.
-_SHORTEST, _LONGER, _BISECTIONS = 0.1, 1.3, 5
+# Shortest duration of a stroke, s, which a controller can follow: without rotors, and with rotors, whose thrust lags.
+_SHORTEST = (0.1, 0.2)
+# Ratio of successive trial durations, and number of bisections between two of them.
+_LONGER, _BISECTIONS = 1.3, 5
 # Number of instants at which a stroke is checked.
 _INSTANTS = 25
 # A stroke uses at most this share of the range of torques and thrusts.  The rest is left to the controller.
 _SHARE = 0.95
-_SINGULAR = "a posture that is nearly singular"
+_SINGULAR, _BENT = "a posture that is nearly singular", "a sharp bend of the constraints"
 # Progress over τ = t/T, highest power first: the speed rises as 3τ² − 2τ³ to its end value, or falls from it.
 _RISING, _FALLING = np.array([-1.0, 2.0, 0.0, 0.0, 0.0]), np.array([1.0, -2.0, 0.0, 2.0, 0.0])
 
@@ -79,11 +82,13 @@ class Stroke:
             A = rows(numeric.at(at))
             return np.asarray(u + np.linalg.pinv(A, rcond=_RANK) @ (kept - A @ u))
 
-        size = float(np.linalg.norm(u))
+        # After a plastic impact, a robot can be at rest.
+        size = max(float(np.linalg.norm(u)), _AT_REST)
         self.time = min(time, _FARTHEST / size)
         count = max(_LEAST, int(np.ceil(self.time * size / _KNOTS)))
+        shorter = ""
         for _ in range(_HALVINGS + 1):
-            h, postures, self.end = (-1 if before else 1) * self.time / count, [q], ""
+            h, postures, self.end = (-1 if before else 1) * self.time / count, [q], shorter
             for _ in range(count):
                 middle = along(np.array(pin.integrate(model, postures[-1], h / 2 * along(postures[-1]))))
                 if np.linalg.norm(middle) > _FASTER * size:
@@ -96,7 +101,7 @@ class Stroke:
                     self.end = self._obstacle(postures[-1], step)
                     break
                 postures.append(moved)
-            self.time = abs(h) * (len(postures) - 1)
+            self.time = abs(h) * max(1, len(postures) - 1)
             if len(postures) > _LEAST // 2:
                 ends = (None, u * self.time) if before else (u * self.time, None)
                 curve = PathCurve(space, postures[::-1] if before else postures, ends)
@@ -104,8 +109,7 @@ class Stroke:
                     self.curve = curve
                     return
             # A shorter curve has more knots for its length.
-            self.time /= 2
-        self.end = self.end or _SINGULAR
+            self.time, shorter = self.time / 2, self.end or _BENT
 
     def _obstacle(self, q: Array, step: Array) -> str:
         """Return the names of the inequalities that a step violates."""
@@ -155,7 +159,7 @@ class Stroke:
         def works(duration: float) -> bool:
             return self.need(limits, duration, factor, stop=True).share <= 1
 
-        low = high = min(_SHORTEST, most)
+        low = high = min(_SHORTEST[limits.rotors], most)
         while not works(high):
             if high >= most:
                 return None
@@ -167,7 +171,7 @@ class Stroke:
 
     def hindrance(self, limits: ActuatorLimits, factor: float) -> str:
         """Return what prevents a motion with the velocity ``factor u``: the limit that it exceeds least, and why."""
-        durations = np.geomspace(min(_SHORTEST, self.time / factor), 2 * self.time / factor, 12)
+        durations = np.geomspace(min(_SHORTEST[0], self.time / factor), 2 * self.time / factor, 12)
         least = min((self.need(limits, d, factor) for d in durations), key=lambda need: need.share)
         room = f", and the motion cannot be longer because of {self.end}" if self.end else ""
         return least.of + room

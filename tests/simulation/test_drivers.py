@@ -105,6 +105,8 @@ def test_all_controllers_share_gains_tasks_and_weights(monkeypatch: pytest.Monke
         still = {"q": np.tile(factory.setup.q, (2, 1)), "v": np.zeros((2, factory.setup.robot.nv))}
         path = SimpleNamespace(duration=0.0, t=np.array([0.0, 1.0]), a=still["v"], **still)
         monkeypatch.setitem(vars(factory), "path", path)
+        strike = SimpleNamespace(follow_through=None, run_up_s=0.0, contact_s=0.0)
+        monkeypatch.setitem(vars(factory), "strike", SimpleNamespace(strike=strike, **vars(path)))
         nominal = factory.driver("nominal").controller.formulation
         for controller in CONTROLLERS:
             formulation = factory.driver(controller).controller.formulation

@@ -33,9 +33,10 @@ from tests.simulation.factories import (
 
 # In scenarios without an approach, `reference-spreading` and `impact-aware` equal the nominal controller.
 APPROACH = ("reference-spreading", "impact-aware")
-# The controller `path` has separate tests.
-ALL = [("aerial-vertical", name, "live") for name in CONTROLLERS if name != "path"]
-ALL += [("solo8-push", name, "live") for name in CONTROLLERS if name not in ("path", *APPROACH)]
+# Controllers with separate tests.
+PATHS = ("path", "strike")
+ALL = [("aerial-vertical", name, "live") for name in CONTROLLERS if name not in PATHS]
+ALL += [("solo8-push", name, "live") for name in CONTROLLERS if name not in (*PATHS, *APPROACH)]
 FEW = ("nominal", "robust", "robust-flow", "walker", "invariant")
 ALL += [(name, few, "live") for name in ("aerial-lateral", "talos-push") for few in FEW]
 ALL += [("aerial-lateral", "reference-spreading", "live"), ("talos-push", "posture", "live")]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import metadata
 from typing import Literal, get_args
@@ -31,6 +31,7 @@ from impact_posture.simulation.controllers.impact_baselines import (
     InvariantDriver,
     ReferenceSpreadingDriver,
 )
+from impact_posture.simulation.controllers.strike_driver import StrikeDriver
 from impact_posture.simulation.controllers.task_formulations import nominal_posture, posture_options
 from impact_posture.simulation.offline_posture import OfflinePosture, offline_posture
 from impact_posture.simulation.scenario_objective import Gradient, compiled, interpreted, scenario_objective
@@ -56,6 +57,7 @@ MEANING: dict[str, str] = {
     "posture": "the offline optimum as posture, no gradient",
     "posture-sticking": "like posture, with the optimum of S, for impacts at a given speed",
     "path": "like posture, but along a timed path without collisions",
+    "strike": "arrives at the optimum of the sticking jump with the stated speed along a path, then stops",
     "stiff": "the start posture, as stiff as the term is where robust rests",
     "posture-stiff": "like posture, with the stiffness of the impact-robust term at the optimum",
     "invariant": "nominal, but impulses do not affect the velocity feedback around the impact",
@@ -80,9 +82,10 @@ _KINDS: dict[str, ObjectiveKind] = {
     "robust-sticking": "sticking",
     "robust-flow-sticking": "sticking",
     "posture-sticking": "sticking",
+    "strike": "sticking",
 }
 # Controllers that move to an offline posture.
-_OFFLINE = ("posture", "posture-sticking", "path")
+_OFFLINE = ("posture", "posture-sticking", "path", "strike")
 # Entry points by which other installed packages add controllers.
 GROUP = "impact_posture.controllers"
 
@@ -174,6 +177,29 @@ class ControllerFactory:
         tell("looking for a path to the offline posture")
         return posture_path(solution)
 
+    @cached_property
+    def strike(self) -> PosturePath:
+        """Path that the controller ``strike`` follows from the start posture, to the speed of the contacts.
+
+        Raises:
+            InputError: The scenario has no contacts, or no strike is possible.
+        """
+        check_package()
+        setup, contacts = self.setup, self.setup.scenario.contacts
+        solution = replace(self._optimum("strike").solution, initial=setup.q)
+        tell("looking for a path that strikes")
+        path = posture_path(solution, strike=0.0 if contacts is None else contacts.speed)
+        if path.strike is None:
+            raise InputError(f"cannot strike: {path.reason}", where="strike", hint="change the start posture")
+        return path
+
+    def path_of(self, name: str) -> PosturePath | None:
+        """Return the path that a controller follows; ``None`` if it follows none."""
+        name = name.removesuffix(_STIFF)
+        if name == "strike" and self.setup.scenario.contacts is not None:
+            return self.strike
+        return self.path if name == "path" else None
+
     def driver(self, name: str, mode: Mode = "live", gain: float | None = None) -> Driver:
         """Build the driver of a controller.
 
@@ -210,6 +236,8 @@ class ControllerFactory:
             return self._stiffened(name.removesuffix(_STIFF), name.removesuffix(_STIFF), gain)
         if name == "path":
             return PathDriver(setup, nominal_posture(setup), self.path)
+        if name == "strike" and setup.scenario.contacts is not None:
+            return StrikeDriver(setup, nominal_posture(setup), self.strike)
         if name in _OFFLINE:
             return PostureDriver(setup, nominal_posture(setup), self._optimum(name).q)
         if name in _PLAIN:

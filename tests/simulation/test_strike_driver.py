@@ -1,0 +1,98 @@
+"""The controller that strikes along a planned path."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from impact_posture.path.posture_path import PosturePath
+from impact_posture.simulation.controllers.contact_reference import Reference
+from impact_posture.simulation.controllers.controller_factory import ControllerFactory
+from impact_posture.simulation.controllers.strike_driver import StrikeDriver
+from impact_posture.simulation.metrics import measure
+from impact_posture.simulation.outcome import judge
+from impact_posture.simulation.prediction import predict
+from impact_posture.simulation.run import Run
+from impact_posture.simulation.scenario_file import RepeatedContacts
+from impact_posture.simulation.setup import set_up
+from tests.simulation.factories import controller_factory, driven, shortened
+
+pytest.importorskip("toppra", reason="toppra is not installed (the extra 'path')")
+CONTACTS = {"count": 2, "settle": 1.5, "dwell": 0.2, "pause": 0.3}
+
+
+@cache
+def factory_of(nearer: float = 0.0) -> ControllerFactory:
+    """Return a factory of an arm and a table, which is nearer than planned by this distance, m."""
+    scenario = shortened("panda-tap", **CONTACTS).scenario
+    surfaces = tuple(replace(s, gap=s.gap - nearer) for s in scenario.surfaces)
+    factory = controller_factory(set_up(replace(scenario, surfaces=surfaces)))
+    factory.starts = 1
+    return factory
+
+
+def expected(factory: ControllerFactory) -> list[float]:
+    """Return the times at which the scenario expects the contacts, s."""
+    task = factory.setup.scenario.contacts
+    assert isinstance(task, RepeatedContacts)
+    reference = Reference(task, factory.setup.gap)
+    return [reference.start(k) + reference.inward - 2 * task.beyond / task.speed for k in range(task.count)]
+
+
+@cache
+def struck() -> tuple[ControllerFactory, Run, PosturePath]:
+    factory = factory_of()
+    return factory, driven(factory, "strike"), factory.strike
+
+
+def test_speed_time_and_jump_of_the_contacts_are_as_planned() -> None:
+    factory, record, path = struck()
+    metrics = measure(factory.setup, record)
+    assert judge(factory.setup, record) == () and metrics.contacts == 2 and metrics.failed_ticks == 0
+    windows, predictions = list(record.of("impact")), predict(factory.setup, factory.objective(), record)
+    assert path.strike is not None and path.strike.speed == 0.5 and len(predictions) == 2
+    for window, prediction, at in zip(windows, predictions, expected(factory), strict=True):
+        assert abs(window.begin - at) < 0.01
+        assert prediction.approach == pytest.approx(0.5, rel=0.05)
+        # The surface has the restitution 0.13, which the prediction does not contain.
+        assert prediction.ratio == pytest.approx(1.0, abs=0.15)
+        # The posture at the contact is the planned one, up to the lag of the soft posture task.  No motor is at its
+        # limit before.
+        k = int(np.searchsorted(record.series.t, window.begin)) - 1
+        assert np.abs(record.series.q[k] - path.q[-1]).max() < 0.05
+        effort = np.asarray(factory.setup.robot.model.effortLimit)
+        assert (np.abs(record.series.torque[:k]) < 0.999 * effort).all()
+
+
+def test_a_strike_reduces_the_jump_beside_the_nominal_posture() -> None:
+    factory, record, _ = struck()
+    nominal = driven(factory, "nominal")
+    ours, theirs = (predict(factory.setup, factory.objective(), each) for each in (record, nominal))
+    assert ours[0].measured < 0.95 * theirs[0].measured
+
+
+@pytest.mark.parametrize("nearer", [0.01, -0.01])
+def test_a_surface_20_ms_too_near_or_too_far_is_struck_once(nearer: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    factory, (*_, path) = factory_of(nearer), struck()
+    # The path ends where the surface is believed to be.
+    monkeypatch.setitem(vars(factory), "strike", path)
+    record = driven(factory, "strike")
+    metrics = measure(factory.setup, record)
+    assert judge(factory.setup, record) == () and metrics.contacts == 2 and metrics.failed_ticks == 0
+    for prediction in predict(factory.setup, factory.objective(), record):
+        # The speed rises as 3τ² − 2τ³, so at 60 % of the distance of 25 mm it is almost the speed of the impact.
+        assert prediction.approach == pytest.approx(0.5, rel=0.15)
+    # The references stop at the contact, so the arm is at rest soon afterwards.
+    window = next(iter(record.of("impact")))
+    after = (record.series.t > window.begin + 0.25) & (record.series.t < window.begin + 0.3)
+    assert np.abs(record.series.v[after]).max() < 0.1
+
+
+def test_a_push_is_awaited_in_the_optimum() -> None:
+    factory = controller_factory(shortened("solo8-push"))
+    factory.starts = 1
+    driver = factory.driver("strike")
+    assert not isinstance(driver, StrikeDriver) and factory.path_of("strike") is None
