@@ -77,7 +77,8 @@ def read_mjcf(path: Path, root: Root | None) -> MjcfFile:
     """Compile an MJCF.  ``root`` adds or removes the free joint; ``None`` keeps the root of the file.
 
     Raises:
-        MjcfError: MuJoCo rejects the file, or the file couples joints by loops, tendons or polynomials.
+        MjcfError: MuJoCo rejects the file, crashes, or takes too much time or memory.  Or the file couples joints by
+            loops, tendons or polynomials.
         InputError: MuJoCo is not installed.
     """
     import_mujoco()

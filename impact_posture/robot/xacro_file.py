@@ -94,7 +94,7 @@ def expand_xacro(
     where expanded files often are.
 
     Raises:
-        UrdfError: The file cannot be expanded.
+        UrdfError: The file cannot be expanded, or this takes too much time or memory.
         PackageNotFound: A package does not exist.
         InputError: xacro is not installed, or the file has no argument of this name.
     """

@@ -11,6 +11,8 @@ from pathlib import Path
 # Largest number of characters in a file.  The result of a long search, the largest file that this package writes, has
 # about a million characters.
 MOST_CHARACTERS = 1 << 26
+# Largest file that is read into memory at once, bytes.
+MOST_BYTES = 1 << 30
 
 
 def open_regular(path: Path) -> BufferedReader:
@@ -33,8 +35,14 @@ def open_regular(path: Path) -> BufferedReader:
 
 
 def read_bytes(path: Path) -> bytes:
-    """Return the content of a regular file; errors are as in :func:`open_regular`."""
+    """Return the content of a regular file.
+
+    Raises:
+        OSError: The file cannot be read, or is larger than :data:`MOST_BYTES`.
+    """
     with open_regular(path) as file:
+        if os.fstat(file.fileno()).st_size > MOST_BYTES:
+            raise OSError(errno.EFBIG, os.strerror(errno.EFBIG), str(path))
         return file.read()
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import impact_posture
-from impact_posture.system.text_files import open_regular, read_bytes, read_text
+from impact_posture.system.text_files import MOST_BYTES, MOST_CHARACTERS, open_regular, read_bytes, read_text
 
 ROOT = Path(impact_posture.__file__).parent
 # Modules that call these methods for other than files of users, and the reason.
@@ -76,3 +76,12 @@ def test_regular_files_and_the_null_device_are_read(tmp_path: Path) -> None:
     assert read_text(Path(os.devnull)) == ""
     with pytest.raises(IsADirectoryError):
         read_text(tmp_path)
+
+
+def test_huge_files_are_refused(tmp_path: Path) -> None:
+    """The files have holes, so that they need no space on the disk."""
+    for read, size in ((read_text, MOST_CHARACTERS), (read_bytes, MOST_BYTES)):
+        (tmp_path / "file").touch()
+        os.truncate(tmp_path / "file", size + 1)
+        with pytest.raises(OSError, match="too large"):
+            read(tmp_path / "file")
