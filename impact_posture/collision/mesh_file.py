@@ -17,13 +17,15 @@ import pinocchio as pin
 from impact_posture.collision.shape_corners import Triangles, mesh_points, mesh_triangles, renumbered
 from impact_posture.config.cached_values import do_not_store
 from impact_posture.system.arrays import Array
-from impact_posture.system.isolated_calls import CallFailed, isolated_calls
+from impact_posture.system.isolated_calls import CallFailed, CallTimedOut, isolated_calls
 from impact_posture.system.text_files import open_regular, read_bytes
 
 # Largest mesh file, bytes, because loading a binary STL takes about 20 times its size in memory.
 LARGEST_FILE = 100_000_000
 # Processor time to read a mesh: a basic time, s, and bytes per second above it.  The largest binary STL takes 16 s.
 _SECONDS, _BYTES_PER_SECOND = 5.0, 2_500_000
+# Least time, s, for a mesh of a robot with meshes that took too long.
+_LEAST_SECONDS = 0.5
 # Largest number of vertices of a mesh file with fewer bytes.  A short file can repeat its parts a million times.
 _MOST_VERTICES = 200_000
 # Number of meshes in memory, enough for a robot.
@@ -68,8 +70,13 @@ def read_meshes(paths: Iterable[Path]) -> None:
     stamps = [stamp for stamp in dict.fromkeys(map(_stamp, paths)) if stamp not in _READ]
     for stamp in list(_READ)[: max(0, len(_READ) + len(stamps) - _MOST_MESHES)]:
         del _READ[stamp]
-    outcomes = isolated_calls(_parsed, stamps, lambda stamp: _SECONDS + stamp[1] / _BYTES_PER_SECOND)
-    _READ.update(zip(stamps, outcomes, strict=True))
+
+    def seconds(stamp: _Stamp) -> float:
+        # After each mesh that took too long, the next has half of its time, so that many meshes do not take minutes.
+        slow = sum(isinstance(_READ.get(other), CallTimedOut) for other in stamps)
+        return max((_SECONDS + stamp[1] / _BYTES_PER_SECOND) * 0.5**slow, _LEAST_SECONDS)
+
+    _READ.update(zip(stamps, isolated_calls(_parsed, stamps, seconds), strict=True))
 
 
 def read_mesh(path: Path) -> Mesh:
@@ -100,6 +107,10 @@ def _stamp(path: Path) -> _Stamp:
 
 def _parsed(stamp: _Stamp) -> Mesh:
     path = stamp[0]
+    if path.suffix.lower() == ".3mf":
+        with open_regular(path) as file, zipfile.ZipFile(file) as archive:
+            if sum(entry.file_size for entry in archive.infolist()) > LARGEST_FILE:
+                raise UnusableShape(too_large(path))
     transform, unit = _root_transform(path), _unit(path)
     # Use a new loader every time, because a loader keeps all meshes in memory.  The volumes are not used, and BV_AABB
     # volumes are made fastest.
@@ -114,13 +125,9 @@ def _parsed(stamp: _Stamp) -> Mesh:
     return Mesh(points, renumbered(len(points), triangles), unit)
 
 
-def file_size(path: Path) -> int:
-    """Return the number of bytes in a mesh file, or in the files of a 3MF archive."""
-    with suppress(zipfile.BadZipFile):
-        if path.suffix.lower() == ".3mf":
-            with open_regular(path) as file, zipfile.ZipFile(file) as archive:
-                return sum(entry.file_size for entry in archive.infolist())
-    return path.stat().st_size
+def too_large(path: Path) -> str:
+    """Return the message about a mesh file larger than :data:`LARGEST_FILE`."""
+    return f"{path} is larger than {LARGEST_FILE // 1_000_000} MB; simplify the mesh"
 
 
 def _unit(path: Path) -> float:

@@ -19,9 +19,9 @@ import pinocchio as pin
 from impact_posture.collision.mesh_file import (
     LARGEST_FILE,
     UnusableShape,
-    file_size,
     read_mesh,
     states_y_up,
+    too_large,
 )
 from impact_posture.collision.shape_corners import Corrected, hull_surface, triangle_mesh
 from impact_posture.config.text_parsers import finite_numbers
@@ -219,8 +219,8 @@ def _find_mesh(text: str, files: RobotFiles) -> Path:
         if path.is_file():
             if not os.access(path, os.R_OK):
                 raise UnusableShape(f"{path} cannot be read; change its permissions")
-            if file_size(path) > LARGEST_FILE:
-                raise UnusableShape(f"{path} is larger than {LARGEST_FILE // 1_000_000} MB; simplify the mesh")
+            if path.stat().st_size > LARGEST_FILE:
+                raise UnusableShape(too_large(path))
             return path
     hint = "name the folder above the package with `package_dir`" if scheme == "package" else "correct the path"
     raise UnusableShape(f"no mesh '{text}'; {hint}")

@@ -10,7 +10,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 from impact_posture.errors import ImpactPostureError, WorkerDied
 from impact_posture.system.processes import Copy, fork_stream
@@ -20,8 +20,8 @@ _Result = TypeVar("_Result")
 
 # Memory that the calls may allocate, bytes: 1.5 times the memory for the largest mesh file.
 MOST_MEMORY = 3 << 30
-# A call that sleeps for this time, s, waits for a pipe or a device.  The copy of the process reads only local files.
-_LONGEST_SLEEP = 2.0
+# A call that sleeps for this time, s, waits for a pipe or a device.  Linux does not count a wait for a disk as sleep.
+_LONGEST_SLEEP = 1.0
 _TOO_LARGE = "takes too much memory to read"
 # Time between two looks at a call, s.
 _PAUSE = 0.2
@@ -29,6 +29,10 @@ _PAUSE = 0.2
 
 class CallFailed(ImpactPostureError):
     """A call crashed or exceeded a limit.  A repetition may succeed, for example on a faster machine."""
+
+
+class CallTimedOut(CallFailed):
+    """A call exceeded its processor time."""
 
 
 class _Outcome(NamedTuple, Generic[_Result]):
@@ -57,14 +61,14 @@ def isolated_calls(
     def outcomes() -> Iterator[_Outcome[_Result]]:
         # This process reports the errors of the copy.
         faulthandler.disable()
+        signal.signal(signal.SIGPROF, signal.SIG_DFL)
         os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
         _limit(resource.RLIMIT_CORE, 0)
         if before := _memory():
             _limit(resource.RLIMIT_AS, before + MOST_MEMORY)
         for item in items[done:]:
-            used = os.times()
-            # The limit is in whole seconds.
-            _limit(resource.RLIMIT_CPU, int(used.user + used.system + seconds(item)) + 1)
+            # After this processor time, the signal SIGPROF ends the copy.
+            signal.setitimer(signal.ITIMER_PROF, seconds(item))
             result = _result(function, item)
             yield _Outcome(result, _memory() > before + MOST_MEMORY // 4)
 
@@ -111,20 +115,17 @@ def _received(copy: Copy[_Outcome[_Result]], seconds: float) -> _Outcome[_Result
             used, since = now, time.monotonic()
         elif time.monotonic() > since + _LONGEST_SLEEP:
             copy.process.kill()
-            return _failed("names a pipe or a device, which is not read")
+            return _Outcome(CallFailed("names a pipe or a device, which is not read"), True)
     try:
         outcome = copy.receive()
-        return _failed(_TOO_LARGE) if isinstance(outcome.result, MemoryError) else outcome
+        return _Outcome(CallFailed(_TOO_LARGE), True) if isinstance(outcome.result, MemoryError) else outcome
     except MemoryError:  # The copy could not send its result.
-        return _failed(_TOO_LARGE)
+        return _Outcome(CallFailed(_TOO_LARGE), True)
     except WorkerDied:
         copy.process.join()
-    if copy.process.exitcode == -signal.SIGXCPU:
-        return _failed(f"takes more than {seconds:.0f} s to read")
-    return _failed(_TOO_LARGE if copy.process.exitcode == -signal.SIGKILL else "crashes its reader")
-
-
-def _failed(why: str) -> _Outcome[Any]:
+    if copy.process.exitcode == -signal.SIGPROF:
+        return _Outcome(CallTimedOut(f"takes more than {seconds:.2g} s to read"), True)
+    why = _TOO_LARGE if copy.process.exitcode == -signal.SIGKILL else "crashes its reader"
     return _Outcome(CallFailed(why), True)
 
 

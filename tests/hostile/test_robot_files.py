@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from impact_posture.collision.mesh_file import UnusableShape
+from impact_posture.collision.mesh_file import UnusableShape, read_mesh
 from impact_posture.collision.urdf_shapes import read_urdf_shapes
 from impact_posture.robot.robot_loader import load_robot
 from tests.hostile.arena import SMALL, strike
@@ -108,10 +108,8 @@ def test_an_archive_that_grows(arena: Path) -> None:
     """The archive has 0.1 MB, and its content has 110 MB."""
     with zipfile.ZipFile(arena / "a.3mf", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         archive.writestr("3D/3dmodel.model", b" " * 110_000_000)
-    mesh = '</inertial><collision><geometry><mesh filename="a.3mf"/></geometry></collision>'
-    (arena / "mesh.urdf").write_text(SMALL.replace("</inertial>", mesh, 1))
-    (warning,) = read_urdf_shapes(load_robot(str(arena / "mesh.urdf"))).warnings
-    assert "a.3mf is larger than 100 MB" in warning
+    with pytest.raises(UnusableShape, match="3mf is larger than 100 MB"):
+        read_mesh(arena / "a.3mf")
 
 
 def test_a_mesh_that_ends_too_early(arena: Path) -> None:

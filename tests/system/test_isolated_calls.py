@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import resource
 import signal
@@ -13,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from impact_posture.errors import InputError
+from impact_posture.errors import ImpactPostureError, InputError
 from impact_posture.system import isolated_calls as module
 from impact_posture.system.isolated_calls import CallFailed, isolated_call, isolated_calls
 
@@ -41,7 +42,7 @@ FATES = {
     "abort": (os.abort, "crashes its reader"),
     "killed": (lambda: os.kill(os.getpid(), signal.SIGKILL), "takes too much memory"),
     "too large": (lambda: np.ones(1 << 30), "takes too much memory"),
-    "endless": (busy, "takes more than 0 s"),
+    "endless": (busy, "takes more than 0.1 s"),
 }
 
 
@@ -61,6 +62,15 @@ def test_a_failed_call_ends_neither_this_process_nor_the_other_calls(
     assert (first, last) == (0, 2) and isinstance(failed, CallFailed) and words in failed.what
     assert capfd.readouterr() == ("", "")
     assert resource.getrlimit(resource.RLIMIT_AS) == limit
+
+
+def test_a_system_without_free_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    def full() -> int:
+        raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+
+    monkeypatch.setattr(os, "fork", full)
+    with pytest.raises(ImpactPostureError, match=r"no process can be started .*; end other processes"):
+        isolated_call(os.getpid, 5.0)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="looks at processes in /proc")
