@@ -20,6 +20,7 @@ from impact_posture.posture.manifold.batch_descent import BatchDescent, Ends
 from impact_posture.posture.manifold.constraint_manifold import ConstraintManifold
 from impact_posture.posture.manifold.feasible_start import FEASIBLE, Projector
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem
+from impact_posture.posture.search.start_draws import StartDraws
 from impact_posture.posture.search.unseen_optima import SAME_VALUE, hits_by_value
 from impact_posture.system.arrays import Array
 
@@ -29,6 +30,9 @@ _WIDTH, _SLOWEST = 512, 1 / 16
 # The number of descents, times the fourth power of the degrees of freedom, is limited by the first number, because
 # descents of large robots take longer.  At least the second number is allowed.
 _WORK, _LEAST = 40_000_000, 16
+# If less than the first share of the first random postures reach the equalities, their ends differ too little.  Then
+# this number of starts that satisfy all constraints descend too; the number is at most the second share of the limit.
+_REACHED, _FEASIBLE, _PART = 0.4, 128, 1 / 8
 # Share of the new descents that are hops.
 _HOPPING = 0.75
 # A hop starts at an optimum with a probability proportional to ``(1 + rank)^-_RANKED / (1 + hops / _TIRED)²``.  The
@@ -89,6 +93,8 @@ def screen(problem: ConstrainedProblem, initial: Array, most: int, seed: int) ->
                 break
             count = min(room, most - drawn)
             search.begin(count)
+            if not drawn and search.descent.active < _REACHED * count:
+                search.begin_feasible(min(_FEASIBLE, int(_PART * most)), seed)
             drawn += count
             if drawn == most and search.descent.active <= _SLOWEST * len(search.ends.x):
                 break
@@ -119,6 +125,13 @@ class _Search:
             x[:hops], tag[:hops] = self._hop(x[:hops])
             self._hops += hops
         self.descent.add(x, tag)
+
+    def begin_feasible(self, count: int, seed: int) -> None:
+        """Begin descents from random starts that satisfy all constraints."""
+        draws = StartDraws(self._problem, (self._initial,), count + 1, seed)
+        starts = [q for k in range(count) if (q := draws.choose(k + 1)) is not None]
+        x = np.array([self._manifold.chart.to_x(q) for q in starts]).reshape(-1, self._manifold.chart.nx)
+        self.descent.add(x, np.full(len(x), _RANDOM))
 
     def step(self) -> None:
         """Continue all descents, and count the random postures that reached each optimum."""
