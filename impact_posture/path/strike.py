@@ -166,7 +166,8 @@ def run_up(problem: ConstrainedProblem, q: Array, speed: float, limits: Actuator
         hindrance = stroke.hindrance(limits, high)
     if duration is None:
         return f"no speed is possible, because of {hindrance}"
-    motion = sampled(space, stroke.curve, limits, stroke.law(duration, low), "")
+    notes = (f"{limits.missing}: the run-up is timed by velocities alone",) if limits.missing else ()
+    motion = sampled(space, stroke.curve, limits, stroke.law(duration, low), "scaled", notes)
     end, distance = float(motion.rows.t[-1]), low * speed * float(motion.rows.t[-1]) / 2
     strike = Strike(
         low * speed, speed, 0.0, distance, end, motion.rows.v[-1], low * share, hindrance if low < 1 else ""

@@ -96,8 +96,8 @@ class Stroke:
                     break
                 step = h * middle
                 moved = space.pulled(postures[-1], step)
-                deflected = moved is None or float(np.linalg.norm(space.difference(postures[-1], moved) - step))
-                if moved is None or deflected > _DEFLECTED * abs(h) * size or not space.clear(postures[-1], moved):
+                off = np.inf if moved is None else np.linalg.norm(space.difference(postures[-1], moved) - step)
+                if moved is None or off > _DEFLECTED * abs(h) * size or not space.clear(postures[-1], moved):
                     self.end = self._obstacle(postures[-1], step)
                     break
                 postures.append(moved)

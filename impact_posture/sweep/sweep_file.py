@@ -25,8 +25,8 @@ OFFSETS = ("x", "y", "z")
 InnerAxis = Literal["normal", "target_quaternion", "target_position", "x", "y", "z", "speed"]
 _INNER = get_args(InnerAxis)
 # Settings that cannot be an axis, because they concern the search or the output.
-_NO_AXIS = ("schema", "q", "starts", "seed", "tradeoff", "tradeoff_against", "path", "search", "finish_all",
-            "contact")  # fmt: skip
+_NO_AXIS = ("schema", "q", "starts", "seed", "tradeoff", "tradeoff_against", "path", "strike", "search",
+            "finish_all", "contact")  # fmt: skip
 _FILES = ("srdf", "config", "weights", "armature", "posture")
 # Maximum number of points of a grid, so that every index is a 64-bit integer.
 _MOST = 10**15

@@ -21,13 +21,12 @@ from impact_posture.simulation.setup import set_up
 from tests.simulation.factories import controller_factory, driven, shortened
 
 pytest.importorskip("toppra", reason="toppra is not installed (the extra 'path')")
-CONTACTS = {"count": 2, "settle": 1.5, "dwell": 0.2, "pause": 0.3}
 
 
 @cache
-def factory_of(nearer: float = 0.0) -> ControllerFactory:
+def factory_of(nearer: float = 0.0, count: int = 1) -> ControllerFactory:
     """Return a factory of an arm and a table, which is nearer than planned by this distance, m."""
-    scenario = shortened("panda-tap", **CONTACTS).scenario
+    scenario = shortened("panda-tap", count=count, settle=0.8, pause=0.3 * (count > 1)).scenario
     surfaces = tuple(replace(s, gap=s.gap - nearer) for s in scenario.surfaces)
     factory = controller_factory(set_up(replace(scenario, surfaces=surfaces)))
     factory.starts = 1
@@ -44,7 +43,7 @@ def expected(factory: ControllerFactory) -> list[float]:
 
 @cache
 def struck() -> tuple[ControllerFactory, Run, PosturePath]:
-    factory = factory_of()
+    factory = factory_of(count=2)
     return factory, driven(factory, "strike"), factory.strike
 
 
@@ -62,14 +61,14 @@ def test_speed_time_and_jump_of_the_contacts_are_as_planned() -> None:
         # The posture at the contact is the planned one, up to the lag of the soft posture task.  No motor is at its
         # limit before.
         k = int(np.searchsorted(record.series.t, window.begin)) - 1
-        assert np.abs(record.series.q[k] - path.q[-1]).max() < 0.05
+        assert np.abs(record.series.q[k] - path.q[-1]).max() < 0.1
         effort = np.asarray(factory.setup.robot.model.effortLimit)
         assert (np.abs(record.series.torque[:k]) < 0.999 * effort).all()
 
 
 def test_a_strike_reduces_the_jump_beside_the_nominal_posture() -> None:
     factory, record, _ = struck()
-    nominal = driven(factory, "nominal")
+    nominal = driven(factory_of(), "nominal")
     ours, theirs = (predict(factory.setup, factory.objective(), each) for each in (record, nominal))
     assert ours[0].measured < 0.95 * theirs[0].measured
 
@@ -81,7 +80,7 @@ def test_a_surface_20_ms_too_near_or_too_far_is_struck_once(nearer: float, monke
     monkeypatch.setitem(vars(factory), "strike", path)
     record = driven(factory, "strike")
     metrics = measure(factory.setup, record)
-    assert judge(factory.setup, record) == () and metrics.contacts == 2 and metrics.failed_ticks == 0
+    assert judge(factory.setup, record) == () and metrics.contacts == 1 and metrics.failed_ticks == 0
     for prediction in predict(factory.setup, factory.objective(), record):
         # The speed rises as 3τ² − 2τ³, so at 60 % of the distance of 25 mm it is almost the speed of the impact.
         assert prediction.approach == pytest.approx(0.5, rel=0.15)

@@ -24,7 +24,8 @@ class StrikeDriver(ImpactFeedbackDriver):
     After :meth:`brace`, the robot moves to the begin of the run-up.  The run-up ends at the expected time of the
     impact.  If there is no contact yet, the references continue at the velocity of the impact.  The contact is felt
     by the force sensor, or because the contact point has less than half of its planned speed.  At the contact, or
-    :attr:`LATE` after the expected time, the references switch to the stop after the impact.
+    :attr:`LATE` after the expected time, the references switch to the stop after the impact.  When the end effector
+    has to return, the robot moves back to the begin of the run-up.
 
     Attributes:
         path: Path with a strike.
@@ -59,20 +60,6 @@ class StrikeDriver(ImpactFeedbackDriver):
     def brace(self) -> None:
         self._left = self._now
 
-    def expect(self, t: float) -> None:
-        if self._hit < np.inf:
-            # Return from the last stop to the begin of the run-up.
-            start, end, zero = (
-                self._moment[0],
-                self._motion.at(self._strike.run_up_s)[0],
-                np.zeros((2, len(self._shift))),
-            )
-            self._until = max(self.controller.period, min(MOVE, t - self._duration - self._now))
-            times = np.array([0.0, self._until])
-            self._way = RowInterpolation(self.setup.robot.model, times, np.array([start, end]), zero, zero)
-            self._left, self._hit = self._now, np.inf
-        super().expect(t)
-
     def tick(self, reading: Reading, reference: ReferencePoint | None = None) -> Command:
         if self._strikes(reading.t) and self._hit == np.inf:
             model, planned = self.setup.robot.model, self._approach(*self._moment_at(reading.t)[:2])
@@ -89,6 +76,8 @@ class StrikeDriver(ImpactFeedbackDriver):
         self._now = t
         if t < self._left:
             return
+        if reference is not None and reference.speed < 0 and self._hit < np.inf:
+            self._retreat()
         q, v, a = self._moment = self._moment_at(t)
         self.posture.lead(q, v, a)
         self._body.lead(self._body_tasks, q, v, a)
@@ -99,6 +88,13 @@ class StrikeDriver(ImpactFeedbackDriver):
             # The pose of an end effector that regulates its position is an array.
             task.target = task.present(state)
             task.target_velocity, task.target_acceleration = J @ v, J @ a + task.drift(state)
+
+    def _retreat(self) -> None:
+        """Begin a motion from the last stop to the begin of the run-up, within :data:`MOVE`."""
+        zero = np.zeros((2, self.setup.robot.nv))
+        ends = np.array([self._moment[0], self._motion.at(self._strike.run_up_s)[0]])
+        self._way = RowInterpolation(self.setup.robot.model, np.array([0.0, MOVE]), ends, zero, zero)
+        self._until, self._left, self._hit, self._at = MOVE, self._now, np.inf, np.inf
 
     def _approach(self, q: Array, v: Array) -> float:
         """Return the speed of the contact point towards the surface, m/s."""
