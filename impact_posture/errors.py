@@ -318,14 +318,16 @@ class SolverFailed(ImpactPostureError):
 
 
 class WorkerDied(ImpactPostureError):
-    """A worker process ended without a result; the message names the option for the number of workers."""
+    """A worker process ended without a result; the message names the option for the number of workers.
 
-    def __init__(self, option: str = "jobs") -> None:
-        super().__init__(
-            "a worker process was killed",
-            where=option,
-            hint=f"give it more memory, or work in one process: `{option}` 1",
-        )
+    ``reason`` is the error of an executor that lost its workers on other machines.
+    """
+
+    def __init__(self, option: str = "jobs", reason: str = "") -> None:
+        what, hint = "a worker process was killed", f"give it more memory, or work in one process: `{option}` 1"
+        if reason:
+            what, hint = f"the workers were lost ({reason})", "check them, and run the command again to continue"
+        super().__init__(what, where=option, hint=hint)
 
 
 class SimulationDiverged(ImpactPostureError):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -29,8 +30,22 @@ def dask_cluster(address: str) -> Iterator[Executor]:
     except (OSError, ValueError) as error:
         what, hint = f"no Dask scheduler answers ({error})", "start a scheduler, or correct the address"
         raise InputError(what, where=f"scheduler {address}", hint=hint) from None
-    with client:
+    with _unlogged("distributed", "distributed.client"), client:
         yield client.get_executor()
+
+
+@contextmanager
+def _unlogged(*names: str) -> Iterator[None]:
+    """Log no messages of other packages, because errors of their executors are raised, too."""
+    loggers = [logging.getLogger(name) for name in names]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
 
 
 @contextmanager

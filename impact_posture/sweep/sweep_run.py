@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,8 @@ Progress = Callable[[int, int], None]
 # Maximum number of shards that are submitted and not yet written.  A larger number needs more memory.  With a smaller
 # number, workers may have to wait for the next shard.
 IN_HAND = 64
+# Packages whose errors mean that an executor lost its workers.
+_EXECUTORS = ("distributed", "mpi4py", "submitit")
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,8 @@ def run_sweep(
     Raises:
         InputError: pyarrow is not installed, or a setting is invalid for the robot.
         OutputError: The folder contains other files, or cannot be written.
-        WorkerDied: A worker process was killed.  Run the sweep again to continue it.
+        WorkerDied: A worker process was killed, or the executor lost its workers.  Run the sweep again to continue
+            it.
     """
     check_package("pyarrow", "sweep")
     key = sweep_key(sweep)
@@ -97,8 +100,18 @@ def run_sweep(
                         progress(done, points)
         except BrokenExecutor:
             raise WorkerDied("workers") from None
+        except Exception as error:
+            if not _is_lost(error):
+                raise
+            raise WorkerDied("workers", f"{type(error).__name__}: {error}".rstrip(": ")) from None
         atlas.finish()
     return SweepRun(folder, sweep.points, counts, shards, solver_s, total_s, tuple(sorted(atlas.damaged)))
+
+
+def _is_lost(error: Exception) -> bool:
+    """Return whether an error of an executor means that its workers, jobs or scheduler cannot be reached."""
+    package = type(error).__module__.partition(".")[0]
+    return isinstance(error, CancelledError | ConnectionError | TimeoutError) or package in _EXECUTORS
 
 
 def _results(tasks: Iterable[tuple[Any, ...]], executor: Executor | None, in_hand: int) -> Iterator[ShardResult]:
