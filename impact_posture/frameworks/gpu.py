@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from impact_posture.codegen.impact_gradient import ImpactGradient
+from impact_posture.config.checked import checked
 from impact_posture.errors import InputError, SpecError
 from impact_posture.system.optional_package import import_extra
 from impact_posture.system.text_files import read_text
@@ -36,6 +37,7 @@ _JOINTS = {
 }
 
 
+@checked
 def load(
     path: str | Path, *, robot: Robot | None = None, frame: str | None = None, free: bool = False
 ) -> BatchMetric:

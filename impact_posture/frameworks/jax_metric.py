@@ -47,15 +47,21 @@ class JaxMetric:
         """Return ``H`` for the unit normal ``n``, shape (3,) or (…, 3).
 
         Raises:
-            InputError: A derivative with respect to ``n`` is requested.
+            InputError: ``q`` has the wrong shape, or a derivative with respect to ``n`` is requested.
         """
-        numpy = self._jax.numpy
-        q = numpy.asarray(q)
+        q, numpy = self._postures(q), self._jax.numpy
         return self._function(q, numpy.broadcast_to(numpy.asarray(n, dtype=q.dtype), (*q.shape[:-1], 3)))
 
     def objective(self, q: Any) -> Any:
         """Return the objective of the export, such as the effective mass."""
-        return self._function(self._jax.numpy.asarray(q))
+        return self._function(self._postures(q))
+
+    def _postures(self, q: Any) -> Any:
+        """Return ``q`` as floating-point numbers.  Check its shape here, because JAX hides errors of callbacks."""
+        q, nq = self._jax.numpy.asarray(q), self.batch.gradient.nq
+        if q.shape[-1:] != (nq,):
+            raise InputError(f"has shape {q.shape}", where="q", hint=f"give shape (…, {nq})")
+        return q.astype(self._jax.numpy.result_type(q, float))
 
     def _differentiable(self) -> Any:
         """Return the function of ``q`` and ``n`` that returns ``H``, or of ``q`` that returns the objective."""
@@ -66,7 +72,7 @@ class JaxMetric:
             rows, normals = q.reshape(-1, q.shape[-1]), [array.reshape(-1, 3) for array in normals]
             call = self.batch.value_and_gradient if normals else self.batch.objective
             value, grad = call(rows, *normals, in_q=True)
-            return value.reshape(q.shape[:-1]), grad.reshape(q.shape)
+            return value.reshape(q.shape[:-1]).astype(q.dtype), grad.reshape(q.shape).astype(q.dtype)
 
         def both(q: Any, *n: Any) -> Any:
             shapes = [jax.ShapeDtypeStruct(shape, q.dtype) for shape in (q.shape[:-1], q.shape)]

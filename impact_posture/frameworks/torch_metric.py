@@ -65,7 +65,7 @@ def _operator() -> Any:
         if n is None:
             value, grad = batch.objective(rows, in_q=True)
         else:
-            normals = torch.as_tensor(n, dtype=q.dtype, device=q.device)
+            normals = torch.as_tensor(n, dtype=torch.float64, device=q.device)
             if normals.ndim > 1:
                 normals = normals.expand(*q.shape[:-1], 3).reshape(-1, 3)
             value, grad = batch.value_and_gradient(rows, normals, in_q=True)

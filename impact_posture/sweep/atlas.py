@@ -179,7 +179,7 @@ def open_atlas(folder: str | Path) -> Dataset:
     from pyarrow import ArrowException, dataset, fs
 
     manifest, data = read_manifest(Path(folder)), Path(folder) / _DATA
-    paths = sorted(data.glob("case=*/*.parquet"))
+    paths = sorted(data.glob("case=*/shard-*.parquet"))
     if not paths:
         raise SpecError("has no finished shard", where=str(folder), hint="run sweep again to continue")
     pages = dataset.ParquetFragmentScanOptions(page_checksum_verification=True)

@@ -175,10 +175,10 @@ def _check_replaceable(folder: Path, name: str, path: Path, force: bool) -> None
     """Raise an error if the file ``name`` of a folder must not be replaced; ``path`` is where the file is now."""
     where = str(folder / name)
     if path.is_dir() and not path.is_symlink():
-        raise OutputError("is a folder", where=where, hint="move it away, or choose another folder")
+        raise OutputError("is a folder", where=where, hint="move it away")
     if not force and not is_own(folder, name, path):
         fault = "was not written by this program, or was changed since"
-        raise OutputError(fault, where=where, hint="choose another folder, or `force` to replace it")
+        raise OutputError(fault, where=where, hint="move it away, or `force` to replace it")
 
 
 def _link(source: Path, target: Path) -> None:

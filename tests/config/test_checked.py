@@ -30,7 +30,7 @@ GOOD: list[tuple[Callable[..., Any], dict[str, Any]]] = [
     (ip.Metric, {}),
     (ip.Support, {"frame": "ee"}),
     (ip.ImpactObjective, {"robot": ROBOT, "contact": CONTACT}),
-    (OBJECTIVE.evaluate, {"q": ROBOT.posture()}),
+    *[(call, {"q": ROBOT.posture()}) for call in (OBJECTIVE.evaluate, OBJECTIVE.value_and_gradient)],
     (OBJECTIVE.export, {"out": "out"}),
     (ip.PostureProblem, {"objective": OBJECTIVE}),
     (ip.optimize, {"problem": PROBLEM}),
@@ -42,7 +42,7 @@ GOOD: list[tuple[Callable[..., Any], dict[str, Any]]] = [
     *[(getattr(ROBOT, name), {"name": "ee"}) for name in ("frame_id", "joint_id", "posture")],
     (ROBOT.contact_pose, {"frame": "ee"}),
     *[(getattr(ROBOT, name), {"q": ROBOT.posture()}) for name in ("check_posture", "check_limits")],
-    (ip.ImpactGradient.load, {"path": "out"}),
+    *[(load, {"path": "out"}) for load in (ip.ImpactGradient.load, ip.gpu.load, ip.jax.load, ip.torch.load)],
     (ip.CompiledController.load, {"path": "out"}),
     (ip.export_controller, {"robot": ROBOT, "formulation": FORMULATION}),
     (ip.sweep.open, {"folder": "out"}),
@@ -70,7 +70,7 @@ GOOD: list[tuple[Callable[..., Any], dict[str, Any]]] = [
 # Posture tasks create ReferenceFlow objects, and Task is a base class.  The remaining names are result types.
 OTHERS = {
     "Export", "ImpactPostureError", "PostureResult", "Robot", "__version__", "known_robots", "sweep", "tsid",
-    "ImpactGradient", "CompiledController",
+    "ImpactGradient", "CompiledController", "gpu", "jax", "torch",
     "Command", "Phase", "ReferenceFlow", "Report", "Status", "Task",
 }  # fmt: skip
 
@@ -89,7 +89,7 @@ def _parameters() -> list[Any]:
 
 
 def test_every_public_name_is_tried() -> None:
-    tried = {function.__name__ for function, _ in GOOD} | {"sweep"}
+    tried = {function.__name__ for function, _ in GOOD}
     assert {*ip.__all__, *tsid.__all__} <= tried | OTHERS
 
 

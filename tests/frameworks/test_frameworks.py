@@ -24,6 +24,8 @@ from tests.support.tools import need_compiler
 from tests.support.urdfs import joint, link, load
 
 N = np.array([0.0, 0.6, 0.8])
+# A posture of the robot in ``sample`` in whole numbers.
+WHOLE = [[0] * 6 + [1] + [0] * 2 + [1, 0] + [1, 0] + [0]]
 
 
 @dataclass(frozen=True)
@@ -81,8 +83,7 @@ def test_batches_equal_single_calls_on_all_threads(sample: Sample, monkeypatch: 
     assert np.isnan(metric.objective(broken)[0]).tolist() == [False, True, False]
     with pytest.raises(InputError, match="q: has shape"):
         metric.objective(sample.q[0])
-    whole = [[0] * 6 + [1] + [0] * 2 + [1, 0] + [1, 0] + [0]]
-    assert metric.objective(whole)[0].dtype == float
+    assert metric.objective(WHOLE)[0].dtype == float
     half, _ = metric.value_and_gradient(sample.q[:2].astype(np.float32) * 1.0, N)
     assert half.dtype == np.float32
 
@@ -202,6 +203,7 @@ def test_torch_differentiates(sample: Sample) -> None:
     assert single.dtype == torch.float32 and not single.requires_grad
     tangent = metric.batch.objective(q.detach())
     assert isinstance(tangent[1], torch.Tensor) and tangent[1].shape == (4, sample.objective.robot.nv)
+    assert metric(torch.tensor(WHOLE), N).item() == pytest.approx(of_oracle(sample, np.array(WHOLE[0], float)))
     with pytest.raises(InputError, match="detach n"):
         metric(q, torch.tensor(N, requires_grad=True))
     optimizer = torch.optim.Adam([q], 0.05)
@@ -237,3 +239,7 @@ def test_jax_transforms(sample: Sample) -> None:
         with pytest.raises(InputError, match="derivative with respect to n"):
             jax.grad(metric, argnums=1)(q[0], n)
     assert metric(np.float32(sample.q[:2]), N).dtype == np.float32
+    for whole in (WHOLE, jax.numpy.asarray(WHOLE, dtype=jax.numpy.bfloat16)):
+        assert float(metric(whole, N)[0]) == pytest.approx(of_oracle(sample, np.array(WHOLE[0], float)), rel=0.01)
+    with pytest.raises(InputError, match="give shape"):
+        metric(sample.q[:, 1:], N)
