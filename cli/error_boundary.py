@@ -18,7 +18,7 @@ from typing import Any
 
 import typer
 
-from impact_posture.errors import ImpactPostureError, one_line, printable
+from impact_posture.errors import ImpactPostureError, one_line, printable, remedy
 from impact_posture_cli.output import as_options
 
 DEBUG_VARIABLE = "IMPACT_POSTURE_DEBUG"
@@ -108,7 +108,7 @@ def _place_and_hint(error: OSError) -> tuple[str, str]:
             os.getcwd()
         except OSError:
             where, hint = "the current folder", "it was deleted: change to another folder"
-    return where, "free some space" if error.errno == errno.ENOSPC else hint
+    return where, "free some space" if error.errno == errno.ENOSPC else remedy(error, hint)
 
 
 def _usage(error: Any, wants_json: bool) -> int:

@@ -6,6 +6,7 @@ The command line prints ``what``, ``where`` and ``hint`` as one line and exits w
 from __future__ import annotations
 
 import difflib
+import errno
 import math
 import reprlib
 import unicodedata
@@ -126,7 +127,7 @@ class InputError(ImpactPostureError):
         """Return the error for a file that is missing or cannot be read."""
         if isinstance(error, FileNotFoundError):
             return cls("no such file", where=str(path), hint="check the path")
-        return cls(f"cannot be read ({_reason(error)})", where=str(path), hint=hint)
+        return cls(f"cannot be read ({_reason(error)})", where=str(path), hint=remedy(error, hint))
 
 
 class NameNotFound(InputError):
@@ -252,7 +253,7 @@ class OutputError(InputError):
     @classmethod
     def unwritable(cls, path: Path, error: Exception, hint: str) -> Self:
         """Return the error for a file or folder that cannot be written."""
-        return cls(f"cannot be written ({_reason(error)})", where=str(path), hint=hint)
+        return cls(f"cannot be written ({_reason(error)})", where=str(path), hint=remedy(error, hint))
 
 
 class CompilerError(InputError):
@@ -269,6 +270,12 @@ class ManifestMismatch(InputError):
             where=where,
             hint=hint or "export again for this robot (impact-posture codegen)",
         )
+
+
+def remedy(error: Exception, hint: str) -> str:
+    """Return the hint for a system error.  The given ``hint`` is for errors that concern the file."""
+    number = getattr(error, "errno", None)
+    return "raise the limit of open files (ulimit -n)" if number in (errno.EMFILE, errno.ENFILE) else hint
 
 
 def _reason(error: Exception) -> object:

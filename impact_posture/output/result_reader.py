@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +20,7 @@ from impact_posture.posture.manifold.null_space_path import NullSpacePath
 from impact_posture.posture.search.global_search import SelfMotionMap
 from impact_posture.robot.model_joints import rigid_groups
 from impact_posture.system.arrays import Array
-from impact_posture.system.npz_files import read_arrays
+from impact_posture.system.npz_files import fitting_arrays, read_arrays
 from impact_posture.system.text_files import read_text
 
 # Import matplotlib only where it is used, because the import takes longer than solving a small problem.
@@ -29,6 +29,12 @@ if TYPE_CHECKING:
     from impact_posture.path.posture_path import PosturePath
     from impact_posture.robot.robot import Robot
 
+# Arrays of a null-space path and of a self-motion map.  Undefined quantities are NaN.
+_PATH = {"q": "real n nq", "s": "real n", **dict.fromkeys(("H", "G", "V", "S", "objective"), "float n")}
+_MAP = {
+    "q": "real n nq", "component": "index n", "s": "real n", "objective": "float n", "feasible": "bool n",
+    "start": "index one", "optimum": "index one", "ends": "index optima",
+}  # fmt: skip
 # Exceptions that a changed or incomplete result can cause.
 _BROKEN = (LookupError, ValueError, TypeError, AttributeError, OSError, RecursionError)
 
@@ -88,11 +94,11 @@ def load_result(folder: Path) -> tuple[Prepared, ResultView, dict[str, Any]]:
             fault = f"schema '{shown(document['schema'])}'"
             raise SpecError(fault, where=str(folder / "result.json"), hint="run optimize again")
         prepared = prepare(read_settings(folder / "problem.toml"))
-        arrays = read_arrays(folder / "result.npz")
-        path = NullSpacePath(**{key: arrays[f"path_{key}"] for key in ("q", "s", "H", "G", "V", "S", "objective")})
-        names = [field.name for field in fields(SelfMotionMap)] if "self_motion_q" in arrays else []
-        mapped = SelfMotionMap(**{name: arrays[f"self_motion_{name}"] for name in names}) if names else None
         robot, recorded = prepared.impact.robot, str(document["robot"]["model_sha256"])
+        arrays, sizes = read_arrays(folder / "result.npz"), {"nq": prepared.impact.robot.nq, "one": 1}
+        path = NullSpacePath(**fitting_arrays(arrays, "path_", _PATH, **sizes))
+        has_map = "self_motion_q" in arrays
+        mapped = SelfMotionMap(**fitting_arrays(arrays, "self_motion_", _MAP, **sizes)) if has_map else None
         if recorded != robot.model_sha256:
             fault = f"was made with another model of {robot.name} (sha256 {recorded[:12]}…)"
             hint = "run optimize again, or use the URDF and armature of that result"

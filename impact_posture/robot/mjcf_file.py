@@ -14,7 +14,7 @@ import numpy as np
 from impact_posture.config.problem_settings import Root
 from impact_posture.errors import MjcfError, listed
 from impact_posture.robot.joint_coupling import JointCoupling, composed
-from impact_posture.robot.urdf import MOST_DEGREES_OF_FREEDOM
+from impact_posture.robot.urdf import FARTHEST, MOST_DEGREES_OF_FREEDOM
 from impact_posture.system.arrays import Array
 from impact_posture.system.isolated_calls import CallFailed, isolated_call
 from impact_posture.system.optional_package import import_mujoco, unwarned
@@ -217,6 +217,9 @@ def _check_tree(model: Any, path: Path) -> None:
         if not (np.isfinite(values) if key in _NUMBERS else ~np.isnan(values)).all():
             fault = f"its {key.replace('_', ' ')} is not finite"
             raise MjcfError(fault, where=str(path), hint="correct the nan or inf in the file")
+        if key.endswith("_pos") and (np.abs(values) > FARTHEST).any():
+            fault = f"its {key.replace('_', ' ')} has a coordinate of {np.abs(values).max():g} m"
+            raise MjcfError(fault, where=str(path), hint=f"give coordinates up to {FARTHEST:g} m")
     free = np.flatnonzero(model.jnt_type == import_mujoco().mjtJoint.mjJNT_FREE)
     if free.size and (free.size > 1 or free[0]):
         fault = f"body '{object_name(model, 'body', int(model.jnt_bodyid[free[-1]]))}' floats beside other joints"

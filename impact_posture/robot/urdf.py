@@ -16,6 +16,7 @@ from xml.parsers import expat
 
 import pinocchio as pin
 
+from impact_posture.config.text_parsers import finite_numbers
 from impact_posture.errors import PackageNotFound, SpecError, UrdfError
 from impact_posture.robot.inertia_checks import check_inertias
 from impact_posture.robot.joint_coupling import JointCoupling, urdf_couplings
@@ -24,6 +25,8 @@ from impact_posture.system.text_files import read_bytes
 
 # pin.Data always contains 6 nv³ numbers: 0.4 GB at 200 degrees of freedom, and 48 GB at 1,000.
 MOST_DEGREES_OF_FREEDOM = 200
+# Largest coordinate of an origin, m.  Doubles do not resolve micrometers at greater distances, and hulls fail there.
+FARTHEST = 1e10
 # Largest number of joints in a chain, including fixed joints.  Above 2,000, the URDF parser overflows the stack.
 _DEEPEST = 1_000
 # A comment.  It may contain "--", which XML forbids and urdfdom accepts.
@@ -98,6 +101,7 @@ def build_model(
     """
     text, root = _read(path)
     _check_depth(root, path)
+    _check_origins(root, path)
     below_zero = clear_negative_limits(root)
     couplings, lost = urdf_couplings(root, str(path))
     try:
@@ -105,6 +109,8 @@ def build_model(
             # The decoded text instead of the file, because urdfdom reads each file as UTF-8.
             text = ET.tostring(root, encoding="unicode") if below_zero or couplings else text
             model = pin.buildModelFromXML(text, *([pin.JointModelFreeFlyer()] if free_flyer else []))
+    except OSError:  # No file descriptor is left for quiet_stderr().
+        raise
     except Exception as error:  # The type of exception differs between versions of Pinocchio.
         fault = f"makes no robot ({errors[0] or error})"
         raise UrdfError(fault, where=str(path), hint="correct the URDF") from None
@@ -141,6 +147,16 @@ def _check_depth(root: ET.Element, path: Path) -> None:
     if below:
         link = next(link for link in parents if link in below)
         raise UrdfError(f"link '{link}' is below itself", where=str(path), hint="correct its joints")
+
+
+def _check_origins(root: ET.Element, path: Path) -> None:
+    """Raise an error for origins of joints, masses and shapes that are too far away to compute with."""
+    for owner in (*root.iter("link"), *root.iter("joint")):
+        for origin in owner.iter("origin"):
+            xyz = origin.get("xyz", "")
+            if any(abs(number) > FARTHEST for number in finite_numbers(xyz, 3)):
+                fault = f"{owner.tag} '{owner.get('name', '?')}' has an origin at '{xyz}'"
+                raise UrdfError(fault, where=str(path), hint=f"give coordinates in m, up to {FARTHEST:g}")
 
 
 def parse_urdf(path: Path) -> ET.Element:

@@ -143,7 +143,8 @@ def _origins(model: pin.Model, joints: Sequence[int], postures: Array) -> Array:
     data, origins = model.createData(), np.empty((len(postures), len(joints), 3))
     for k, q in enumerate(postures):
         pin.forwardKinematics(model, data, q)
-        origins[k] = [data.oMi[joint].translation for joint in joints]
+        for column, joint in enumerate(joints):
+            origins[k, column] = data.oMi[joint].translation
     return origins
 
 

@@ -10,10 +10,14 @@ from typing import TYPE_CHECKING, Any
 from impact_posture.system.text_files import open_regular
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
 
 # Largest size of the arrays in a file, bytes: enough for a run of an hour at 1 kHz.
 MOST_BYTES = 1 << 32
+# Squares of larger numbers overflow.
+_LARGEST = 1e100
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
@@ -47,3 +51,38 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
     if strange := [name for name, array in arrays.items() if not isinstance(array, np.ndarray)]:
         raise ValueError(f"'{strange[0]}' of {path.name} is not an array")
     return arrays
+
+
+def fitting_arrays(
+    arrays: Mapping[str, NDArray[Any]], prefix: str, shapes: Mapping[str, str], **sizes: int
+) -> dict[str, NDArray[Any]]:
+    """Return the arrays that ``shapes`` names without their ``prefix``, after a check that they fit each other.
+
+    Args:
+        arrays: Arrays of a file.
+        prefix: First characters of the names in the file.
+        shapes: Name → kind of the numbers and names of the dimensions, such as ``"real n nq"``.  Equal names of
+            dimensions have equal sizes.  The kinds are ``real`` (finite), ``float`` (also NaN), ``bool``, and
+            ``index``, an index along the dimension ``n``.
+        sizes: Known sizes of dimensions.
+
+    Raises:
+        ValueError: An array is missing, empty, of another shape or type, or contains impossible numbers.
+    """
+    import numpy as np
+
+    for name, form in shapes.items():
+        if prefix + name not in arrays:
+            raise ValueError(f"the array '{prefix}{name}' is missing")
+        array, (kind, *dimensions) = arrays[prefix + name], form.split()
+        wanted = [sizes.setdefault(d, size) for d, size in zip(dimensions, array.shape, strict=False)]
+        fits = len(dimensions) == array.ndim and wanted == list(array.shape) and array.size > 0
+        fits = fits and array.dtype.kind in {"bool": "b", "index": "iu"}.get(kind, "fiu")
+        if fits and kind in ("real", "float"):
+            limited = np.abs(array) <= _LARGEST
+            fits = bool((limited if kind == "real" else limited | np.isnan(array)).all())
+        elif fits and kind == "index":
+            fits = 0 <= array.min() and array.max() < sizes["n"]
+        if not fits:
+            raise ValueError(f"the array '{prefix}{name}' does not fit the others or the robot")
+    return {name: arrays[prefix + name] for name in shapes}

@@ -17,7 +17,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from impact_posture.errors import OutputError, listed
+from impact_posture.errors import OutputError, listed, remedy
 from impact_posture.system.folder_record import (
     Kind,
     changed_files,
@@ -108,7 +108,8 @@ def whole_folder(out: Path, *, force: bool, kind: Kind, products: Sequence[str] 
             # Name the missing file, because it may be outside the folder.
             reason = f"{reason}: {error.filename}"
         fault = f"cannot be written ({reason})"
-        raise OutputError(fault, where=str(out), hint="free space or choose another `out`") from error
+        hint = remedy(error, "free space or choose another `out`")
+        raise OutputError(fault, where=str(out), hint=hint) from error
 
 
 @contextmanager

@@ -215,6 +215,17 @@ def save_all(figures: Mapping[str, Figure], out_dir: Path, formats: Iterable[str
     return [path for name, figure in figures.items() for path in save(figure, out_dir, name, formats)]
 
 
+@contextmanager
+def _undated() -> Iterator[None]:
+    """Hide the date of a reproducible build.  Matplotlib reads it for each PDF, and fails if it is not a number."""
+    date = os.environ.pop("SOURCE_DATE_EPOCH", None)
+    try:
+        yield
+    finally:
+        if date is not None:
+            os.environ["SOURCE_DATE_EPOCH"] = date
+
+
 def save(figure: Figure, out_dir: Path, name: str, formats: Iterable[str] = DEFAULT_FORMATS) -> list[Path]:
     """Write ``out_dir/name.<format>`` for each format; return the paths.  An error leaves no incomplete file.
 
@@ -239,7 +250,8 @@ def save(figure: Figure, out_dir: Path, name: str, formats: Iterable[str] = DEFA
                 else:
                     # Files contain no date, so equal figures have equal files.
                     metadata = {"Date" if path.suffix == ".svg" else "CreationDate": None}
-                    figure.savefig(beside / path.name, metadata=metadata)
+                    with _undated():
+                        figure.savefig(beside / path.name, metadata=metadata)
                 os.replace(beside / path.name, path)
         except OSError as error:
             raise OutputError.unwritable(path, error, "choose another folder") from None

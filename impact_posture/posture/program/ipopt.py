@@ -35,6 +35,8 @@ IPOPT_OPTIONS: dict[str, Any] = {
     "ipopt.mumps_permuting_scaling": 0,
     "ipopt.max_iter": 300,
     "print_time": False,
+    # IPOPT rejects a step whose functions overflow, so the warnings of CasADi about them are not errors.
+    "show_eval_warnings": False,
     "calc_lam_p": False,
     # Do not compute sensitivities of the solution, because they are not used.
     "no_nlp_grad": True,
