@@ -105,7 +105,8 @@ class JumpDerivatives:
         ``itself`` decides whether an end joint is on its own path.
         """
         paths = {end: {int(i) for i in self._tree.model.supports[end]} - (set() if itself else {end}) for end in ends}
-        return np.array([[joint in paths[end] for joint in joints] for end in ends], dtype=bool)
+        lies = [joint in paths[end] for end in ends for joint in joints]
+        return np.array(lies, dtype=bool).reshape(len(ends), len(joints))
 
     @cached_property
     def _mass(self) -> ca.SX:

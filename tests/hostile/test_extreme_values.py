@@ -59,7 +59,9 @@ def test_one_sliding_joint(arena: Path, monkeypatch: pytest.MonkeyPatch) -> None
     """Every command works for a robot with one prismatic joint, whose link has the contact shape."""
     pytest.importorskip("mujoco")
     monkeypatch.setattr(plot, "draw_all", lambda *_: [])
-    write(arena, link("base"), link("tip", 1, "0 0 0.1"), joint("slide", "base tip", "1 0 0", kind="prismatic"))
+    box = "0.1 0.1 0.1"
+    slide = joint("slide", "base tip", "1 0 0", kind="prismatic")
+    write(arena, link("base", box=box), link("tip", 1, "0 0 0.3", box=box), slide)
     (arena / "slide.toml").write_text(SCENARIO)
     (arena / "sweep.toml").write_text(
         '[problem]\nrobot = "written.urdf"\nframe = "tip"\nnormal = [1, 0, 0]\nstarts = 1\n[grid]\nspeed = [1, 2]\n'
