@@ -61,7 +61,7 @@ def test_one_sliding_joint(arena: Path, monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(plot, "draw_all", lambda *_: [])
     box = "0.1 0.1 0.1"
     slide = joint("slide", "base tip", "1 0 0", kind="prismatic")
-    write(arena, link("base", box=box), link("tip", 1, "0 0 0.3", box=box), slide)
+    write(arena, link("base", at="0.5 0 0", box=box), link("tip", 1, "0 0 0.3", box=box), slide)
     (arena / "slide.toml").write_text(SCENARIO)
     (arena / "sweep.toml").write_text(
         '[problem]\nrobot = "written.urdf"\nframe = "tip"\nnormal = [1, 0, 0]\nstarts = 1\n[grid]\nspeed = [1, 2]\n'

@@ -97,6 +97,30 @@ def test_pipes_in_a_result(file: str, result: Path, arena: Path) -> None:
         assert (outcome.code, outcome.complaints) == (1, []), (command, outcome.err)
 
 
+MAP = {
+    "q": np.zeros((5, 2)), "component": np.zeros(5, int), "s": np.arange(5.0), "objective": np.arange(1.0, 6.0),
+    "feasible": np.ones(5, bool), "start": np.array([0]), "optimum": np.array([4]), "ends": np.array([1, 4]),
+}  # fmt: skip
+WRONG = {
+    "longer": ("s", np.arange(6.0)), "empty": ("q", np.zeros((0, 2))), "another robot": ("q", np.zeros((5, 3))),
+    "text": ("objective", np.array(["a"] * 5)), "numbers": ("feasible", np.ones(5)), "nan": ("s", np.full(5, np.nan)),
+    "no index": ("optimum", np.array([5])), "negative": ("ends", np.array([-1])), "two": ("start", np.array([0, 1])),
+    "huge": ("component", np.full(5, 10**9)), "scalar": ("ends", np.array(1)), "missing": ("feasible", None),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", [*WRONG, ""])
+def test_arrays_of_a_map_fit_each_other(fault: str, result: Path, arena: Path) -> None:
+    shutil.copytree(result, arena / "out")
+    name, array = WRONG.get(fault, ("s", MAP["s"]))
+    with np.load(result / "result.npz") as file:
+        arrays = dict(file) | {f"self_motion_{key}": value for key, value in {**MAP, name: array}.items()}
+    np.savez(arena / "out" / "result.npz", **{key: value for key, value in arrays.items() if value is not None})
+    outcome = strike(arena, "plot", "out", "--figure", "self_motion", "--format", "svg", "--out", "figures")
+    assert (outcome.code, outcome.complaints) == (1 if fault else 0, []), outcome.err
+    assert not fault or f"the array 'self_motion_{name}'" in outcome.err
+
+
 def spoil_problem(folder: Path, rng: random.Random) -> None:
     path = folder / "problem.toml"
     path.write_bytes(spoiled(path.read_text(), rng))

@@ -9,19 +9,21 @@ import json
 import os
 import random
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
 import impact_posture as ip
-from impact_posture.errors import SpecError
+from impact_posture.errors import ImpactPostureError, SpecError
 from impact_posture.sweep.atlas import Atlas, sweep_key
+from impact_posture.sweep.maps import draw_maps
 from impact_posture.sweep.sweep_file import Sweep, read_sweep
 from impact_posture.sweep.sweep_run import run_sweep
-from impact_posture.system.sealed_files import sealed
+from impact_posture.system.sealed_files import UNSEALED, sealed
 from tests.support.command import run
 
 TEXT = """
@@ -34,6 +36,11 @@ normal = [[0, 0, 1], [0, 0.6, 0.8]]
 speed = [0.5, 1, 2, 4]
 """
 COUNT = 40
+# Values that replace a value of a manifest.
+STRANGE = (
+    None, True, -1, 0, 1e308, 10**400, float("nan"), "", "a", "\0\x1b[31m", "[problem]", [], [[]], [1.0, [2.0]],
+    {}, {"a": 1}, json.loads("[" * 500 + "]" * 500),
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -52,6 +59,14 @@ def shards(folder: Path) -> list[Path]:
 
 def contents(folder: Path) -> dict[str, bytes]:
     return {p.name: p.read_bytes() for p in (folder / "manifest.json", *shards(folder))}
+
+
+def entries(block: Any) -> Iterator[tuple[Any, Any]]:
+    """Yield each table and list of a document with each of its keys."""
+    if isinstance(block, dict | list):
+        for key in block if isinstance(block, dict) else range(len(block)):
+            yield block, key
+            yield from entries(block[key])
 
 
 # ---- kinds of damage: a function changes the content of a shard, or of a second shard ------------------------------
@@ -202,6 +217,41 @@ def test_a_damaged_manifest_is_written_again(solved: tuple[Sweep, str, Path], tm
     again = run_sweep(sweep, tmp_path / "out")
     assert (again.damaged, again.shards) == (("manifest.json",), 0)
     assert contents(tmp_path / "out") == contents(folder)
+
+
+def sealed_text(manifest: Any) -> str:
+    """Return the text of a changed manifest with its right checksum."""
+    if isinstance(manifest, dict) and "checksum" in manifest:
+        manifest["checksum"] = UNSEALED
+    return sealed(json.dumps(manifest).encode()).decode()
+
+
+def test_changed_manifests_end_in_one_line(
+    solved: tuple[Sweep, str, Path], tmp_path: Path, hostile_full: bool
+) -> None:
+    """Half of the manifests have a valid checksum, so that the table of their keys is tested."""
+    folder, refused = Path(shutil.copytree(solved[2], tmp_path / "out")), 0
+    text, rng = (folder / "manifest.json").read_text(), random.Random(5)
+    for _ in range(300 if hostile_full else 30):
+        manifest = json.loads(text)
+        block, key = rng.choice(list(entries(manifest)))
+        block[key] = rng.choice(STRANGE)
+        if rng.random() < 0.2:
+            del block[key]
+        changed = sealed_text(manifest) if rng.random() < 0.5 else json.dumps(manifest)
+        (folder / "manifest.json").write_text(changed)
+        try:
+            draw_maps(folder, tmp_path / "maps")
+        except ImpactPostureError as error:
+            refused += 1
+            assert "\n" not in error.line and len(error.line) < 2000 and str(folder) in error.line
+        try:
+            run_sweep(solved[0], folder)
+        except ImpactPostureError as error:
+            assert "\n" not in error.line and str(folder) in error.line
+        else:
+            assert (folder / "manifest.json").read_text() == text
+    assert refused >= 25
 
 
 def test_folders_without_checksums_are_still_read(solved: tuple[Sweep, str, Path], tmp_path: Path) -> None:
