@@ -121,7 +121,7 @@ def test_a_sweep_replaces_another_sweep_by_force(press: Path, arena: Path) -> No
     assert (arena / "press" / "notes.txt").read_text() == "ten years"
 
 
-@pytest.mark.parametrize("name", ["plot", "report", *{argv[0] for argv in WHOLE.values()}, "inspect"])
+@pytest.mark.parametrize("name", ["plot", "report", *sorted({argv[0] for argv in WHOLE.values()}), "inspect"])
 def test_each_command_that_writes_has_force(name: str) -> None:
     assert any("--force" in option.opts for option in build(name).params)
 
