@@ -175,10 +175,13 @@ def _path(page: Page, path: dict[str, Any]) -> None:
             f"  then stops within {number(after['longest_s'])} s after {after['stopped']} of {after['impacts']} "
             "considered impacts (restitution 0 to 0.5, 80% to 120% of the speed)"
         )
-        for what, room in (("joint limit", after["joints"]), ("clearance", after["clearance"])):
+        for what, unit, room in (
+            ("from a joint limit", "rad (m)", after["joints"]),
+            ("between bodies, beyond the clearance,", "m", after["clearance"]),
+        ):
             if room:
                 where = f"{room['of']}, after {room['impact']}"
-                page.line(f"  the least distance from a {what} is {number(room['distance'])} rad (m): {where}")
+                page.line(f"  the least distance {what} is {number(room['distance'])} {unit}: {where}")
         if after["hindrance"]:
             page.line(f"  {after['hindrance']}")
     # The verdict states why a path does not reach the optimum.

@@ -21,6 +21,7 @@ PICTURES = [
     ("panda --normal -1 0 0 --search global", {"self_motion": "self_motion"}),
     ("talos --frame gripper_right_base_link --normal -1 0 0 --tradeoff", {"tradeoff": "tradeoff"}),
     ("tilthex_arm --frame ee --normal 0 0 1 --path", {"path": "path"}),
+    ("ur5 --normal 0 0 1 --contact-pose aligned --speed 0.5 --path --strike", {"path": "strike"}),
 ]
 
 

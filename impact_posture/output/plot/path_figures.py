@@ -14,6 +14,7 @@ from impact_posture.errors import InputError
 from impact_posture.output.plot.result_view import (
     ResultView,
     TradeOffData,
+    contact_speeds,
     header_lines,
     number,
     objective_unit,
@@ -224,11 +225,13 @@ def motion_figure(view: ResultView) -> Figure:
     use = required(motion.use, "motion", "path", "run optimize again with `path`")
     notes = [_NOTES.get(motion.timing, "")]
     notes += [f"Note: {motion.reason}."] if motion.reason else []
+    notes += ["Dotted lines: begin of the run-up with a smooth rise of speed, and contact."] if motion.strike else []
     with framed(*header_lines(view), 6.2, notes) as (figure, body):
         joints, objective, shares = body.subplots(3, 1, sharex=True, height_ratios=[1.4, 1, 1])
         # The integral of the velocity is continuous.  An angle would jump after a full turn.
-        steps = np.diff(motion.t)[:, None] * (motion.v[1:] + motion.v[:-1]) / 2
-        moved = np.vstack([np.zeros_like(motion.v[:1]), np.cumsum(steps, axis=0)])
+        t, q, v = motion.played
+        steps = np.diff(t)[:, None] * (v[1:] + v[:-1]) / 2
+        moved = np.vstack([np.zeros_like(v[:1]), np.cumsum(steps, axis=0)])
         span = np.ptp(moved, axis=0)
         most = [k for k in np.argsort(-span, kind="stable") if span[k] > _MOVES]
         for rank, k in enumerate(most):
@@ -236,7 +239,7 @@ def motion_figure(view: ResultView) -> Figure:
             if rank < _NAMED:
                 name = re.sub(r"^base ([vw])", lambda match: _MOVED[match[1]], view.robot.tangent_names[k])
                 look = {"color": f"C{rank}", "linewidth": 1.3, "label": plot_label(name)}
-            joints.plot(motion.t, moved[:, k], **look)
+            joints.plot(t, moved[:, k], **look)
         joints.set_ylabel("moved by  [rad or m]")
         joints.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), handlelength=2.4)
         objective.plot(use.at, motion.objectives, color=BLUE, linewidth=1.6)
@@ -252,5 +255,11 @@ def motion_figure(view: ResultView) -> Figure:
         shares.set_xlabel(f"time  [s]; path of {motion.length:.3g} rad (m), found by {motion.method}")
         for axes in (joints, objective, shares):
             axes.grid(True)
+            for time in () if motion.strike is None else (motion.strike.run_up_s, motion.strike.contact_s):
+                axes.axvline(time, **_MARK)
+        if motion.strike is not None:
+            speed = objective.twinx()
+            speed.plot(t, contact_speeds(view, q, v), color=PURPLE, linewidth=1.3, linestyle=(0, (3, 2)))
+            speed.set_ylabel("contact speed  [m/s]", color=PURPLE)
         body.align_ylabels([joints, objective, shares])
     return figure

@@ -211,6 +211,12 @@ def required(data: _Data | None, name: str, figure: str, hint: str) -> _Data:
     return data
 
 
+def contact_speeds(view: ResultView, q: Array, v: Array) -> Array:
+    """Return the speed of the first contact point towards its surface, m/s, at each row of a motion."""
+    oracle = view.objective.singles[0].oracle
+    return np.array([-(oracle.at(here).n @ oracle.J @ velocity) for here, velocity in zip(q, v, strict=True)])
+
+
 def number(value: float | None) -> str:
     """Format a number with three significant digits and the minus sign "−"; ``undefined`` for ``None`` and NaN."""
     if value is None or np.isnan(value):

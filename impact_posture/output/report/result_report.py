@@ -14,7 +14,7 @@ from impact_posture.impact.evaluation.coulomb_jump import coulomb_jump, coulomb_
 from impact_posture.impact.evaluation.velocity_jump import normal_jump
 from impact_posture.impact.impact_contact import point_on
 from impact_posture.output.plot import draw_all
-from impact_posture.output.plot.result_view import ALONE, SEPARATOR, ResultView, header_lines, number
+from impact_posture.output.plot.result_view import ALONE, SEPARATOR, ResultView, contact_speeds, header_lines, number
 from impact_posture.output.quantity_table import QuantityRow, answer_key, quantities, quantity_rows
 from impact_posture.output.report.drawn_robot import draw_robot
 from impact_posture.output.report.report_page import Content, Table, figures, render_summary, write_page
@@ -91,9 +91,7 @@ def _track(prepared: Prepared, view: ResultView) -> Track:
             peaks = [np.nan if mass is None else stiffness.peak_force(mass, view.speed) for mass in masses]
             curves.append((f"peak force{where}", "N", np.array(peaks)))
     if v is not None:
-        each = objective.singles[0]
-        speeds = [-(each.oracle.at(at).n @ each.oracle.J @ nu) for at, nu in zip(q, v, strict=True)]
-        curves.append(("speed of the contact towards the surface", "m/s", np.array(speeds)))
+        curves.append(("speed of the contact towards the surface", "m/s", contact_speeds(view, q, v)))
         shares = (np.abs(v) / view.robot.velocity_limits).max(axis=1)
         curves.append(("largest share of a velocity limit", "1", shares))
     return Track("", times, unit, q, impacts, jumps, tuple(curves))
