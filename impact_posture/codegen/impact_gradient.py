@@ -215,10 +215,8 @@ class ImpactGradient:
         Raises:
             InputError: A shape or a type is wrong.
         """
-        q = self._rows(q)
-        n = np.asarray(n, dtype=self.dtype)
-        if n.shape not in ((3,), (len(q), 3)):
-            raise InputError(f"has shape {n.shape}", where="n", hint=f"give shape (3,) or ({len(q)}, 3)")
+        q, n = np.ascontiguousarray(q, dtype=self.dtype), np.asarray(n, dtype=self.dtype)
+        self.check_shapes(q, n)
         n = np.ascontiguousarray(np.broadcast_to(n, (len(q), 3)))
         return self._batch("eval", (q, n), out, threads)
 
@@ -233,13 +231,16 @@ class ImpactGradient:
         """
         if "objective" not in self._batches:
             raise SpecError("has no objective_batch", where=str(self.manifest["prefix"]), hint="run codegen again")
-        return self._batch("objective", (self._rows(q),), out, threads)
-
-    def _rows(self, q: ArrayLike) -> Array:
         q = np.ascontiguousarray(q, dtype=self.dtype)
+        self.check_shapes(q)
+        return self._batch("objective", (q,), out, threads)
+
+    def check_shapes(self, q: Array, n: Array | None = None) -> None:
+        """Raise ``InputError`` unless ``q`` has shape (N, nq), and ``n`` has shape (3,) or (N, 3)."""
         if q.ndim != 2 or q.shape[1] != self.nq:
             raise InputError(f"has shape {q.shape}", where="q", hint=f"give shape (N, {self.nq})")
-        return q
+        if n is not None and n.shape not in ((3,), (len(q), 3)):
+            raise InputError(f"has shape {n.shape}", where="n", hint=f"give shape (3,) or ({len(q)}, 3)")
 
     def _batch(
         self, name: str, inputs: tuple[Array, ...], out: tuple[Array, Array] | None, threads: int

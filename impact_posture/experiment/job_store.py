@@ -81,12 +81,8 @@ class JobStore:
 
     def find(self, job: Job) -> Document | None:
         """Return the document of a finished job, or ``None`` if a file is missing or damaged."""
-        path = self._path(job)
         try:
-            # Opening a pipe would block.
-            if not path.is_file():
-                return None
-            checksum, _, text = read_text(path).partition("\n")
+            checksum, _, text = read_text(self._path(job)).partition("\n")
             if checksum != _checksum(text.encode()):
                 return None
             stored = json.loads(text)

@@ -103,12 +103,10 @@ class BatchMetric:
         with xp.cuda.Device(device) if on_gpu else nullcontext():
             given = _to(xp, q)
             rows = xp.ascontiguousarray(given, dtype=self.gradient.dtype)
-            if rows.ndim != 2 or rows.shape[1] != self.gradient.nq:
-                raise InputError(f"has shape {rows.shape}", where="q", hint=f"give shape (N, {self.gradient.nq})")
-            scales = None
-            if in_q:
-                rows, scales = self._normalized(xp, rows)
-            inputs = (rows,) if n is None else (rows, xp.asarray(_to(xp, n), dtype=self.gradient.dtype))
+            normals = () if n is None else (xp.asarray(_to(xp, n), dtype=self.gradient.dtype),)
+            self.gradient.check_shapes(rows, *normals)
+            rows, scales = self._normalized(xp, rows) if in_q else (rows, None)
+            inputs = (rows, *normals)
             value, grad = self._launch(xp, (name, device), *inputs) if on_gpu else self._on_cores(name, *inputs)
             if in_q:
                 grad = self._in_coordinates(xp, rows, scales, grad)
@@ -133,8 +131,6 @@ class BatchMetric:
             kernel = self._kernels[key] = module.get_function(expression)
         count, normals = len(q), list[Any]()
         if n is not None:
-            if n.shape not in ((3,), (count, 3)):
-                raise InputError(f"has shape {n.shape}", where="n", hint=f"give shape (3,) or ({count}, 3)")
             normals = [cupy.ascontiguousarray(n), np.int32(n.size // 3)]
         value = cupy.empty(count, dtype=self.gradient.dtype)
         grad = cupy.empty((count, self.gradient.nv), dtype=self.gradient.dtype)

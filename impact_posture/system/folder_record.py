@@ -53,10 +53,7 @@ def sha256_of(path: Path) -> str:
 
 def typed_command(folder: Path) -> str:
     """Return the command line that wrote an output folder; empty if another program wrote the folder."""
-    try:
-        return str(json.loads(read_text(folder / RECORD)).get("command", ""))
-    except (OSError, ValueError, AttributeError, RecursionError):
-        return ""
+    return str((read_record(folder) or {}).get("command", ""))
 
 
 def own_files(folder: Path, kind: Kind) -> list[str]:
@@ -68,7 +65,7 @@ def own_files(folder: Path, kind: Kind) -> list[str]:
 def read_record(folder: Path) -> dict[str, Any] | None:
     """Return the record of a folder; ``None`` if the folder has no valid record."""
     try:
-        content = json.loads(read_text(folder / RECORD)) if (folder / RECORD).is_file() else None
+        content = json.loads(read_text(folder / RECORD))
     except (OSError, ValueError, RecursionError):
         return None
     if not isinstance(content, dict) or content.get("schema") != SCHEMA:
