@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from base64 import b64decode, b64encode
 from collections.abc import Callable, Hashable
 from contextlib import suppress
@@ -16,6 +15,7 @@ from impact_posture.config.table_validation import adapter
 from impact_posture.errors import OutputError
 from impact_posture.system.libraries import cache_folder, check_private
 from impact_posture.system.output_folder import write_whole
+from impact_posture.system.sealed_files import opened_text, sealed_text
 from impact_posture.system.text_files import read_text
 
 _Value = TypeVar("_Value", bound=Hashable)
@@ -50,10 +50,8 @@ def cached(kind: str, key: str, cls: type[_Value], make: Callable[[], _Value]) -
         path = cache_folder(kind) / f"{key}.json"
         check_private(path)
         if path.stat().st_size <= _LONGEST:
-            seal, text = read_text(path).split("\n", 1)
-            if seal == _seal(text):
-                stored: _Value = adapter(cls).validate_json(text)
-                return stored
+            stored: _Value = adapter(cls).validate_json(opened_text(read_text(path)))
+            return stored
     _STORABLE.append(True)
     try:
         value = make()
@@ -63,14 +61,10 @@ def cached(kind: str, key: str, cls: type[_Value], make: Callable[[], _Value]) -
         return value
     text = adapter(cls).dump_json(value).decode()
     with suppress(OSError, OutputError):
-        write_whole(cache_folder(kind) / f"{key}.json", f"{_seal(text)}\n{text}")
+        write_whole(cache_folder(kind) / f"{key}.json", sealed_text(text))
     return value
 
 
 def do_not_store() -> None:
     """Keep the values that are being made out of the cache, because another attempt may give other values."""
     _STORABLE[:] = [False] * len(_STORABLE)
-
-
-def _seal(text: str) -> str:
-    return hashlib.sha256(text.encode()).hexdigest()

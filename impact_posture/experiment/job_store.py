@@ -22,6 +22,7 @@ from impact_posture.simulation.scenario_file import scenario_path
 from impact_posture.system.libraries import source_key
 from impact_posture.system.output_folder import parents_of, used_alone, write_whole
 from impact_posture.system.processes import fork_map, undone
+from impact_posture.system.sealed_files import opened_text, sealed_text
 from impact_posture.system.text_files import read_bytes, read_text
 
 Progress = Callable[[int, int], None]
@@ -82,10 +83,7 @@ class JobStore:
     def find(self, job: Job) -> Document | None:
         """Return the document of a finished job, or ``None`` if a file is missing or damaged."""
         try:
-            checksum, _, text = read_text(self._path(job)).partition("\n")
-            if checksum != _checksum(text.encode()):
-                return None
-            stored = json.loads(text)
+            stored = json.loads(opened_text(read_text(self._path(job))))
             for sign, checksum in stored["series"].items():
                 if checksum != _checksum(read_bytes(self.series(job, int(sign)))):
                     return None
@@ -127,7 +125,7 @@ class JobStore:
             write_whole(self.series(job, run.sign), content.getvalue())
             checksums[str(run.sign)] = _checksum(content.getvalue())
         text = json.dumps({"series": checksums, "document": document})
-        write_whole(self._path(job), f"{_checksum(text.encode())}\n{text}")
+        write_whole(self._path(job), sealed_text(text))
 
     def _path(self, job: Job) -> Path:
         return self.folder / f"{key_of(job)}.json"

@@ -1,4 +1,4 @@
-"""Files that contain the SHA-256 of their other bytes, so that any damage is noticed."""
+"""Files that contain the SHA-256 of their other content, so that any damage is noticed."""
 
 from __future__ import annotations
 
@@ -19,6 +19,19 @@ def is_intact(content: bytes) -> bool:
     """Return whether the content of a sealed file is undamaged."""
     begin, digest = _digest(content)
     return content[begin : begin + _DIGITS] == digest
+
+
+def sealed_text(text: str) -> str:
+    """Return a text behind a line with its SHA-256."""
+    return f"{sha256(text.encode()).hexdigest()}\n{text}"
+
+
+def opened_text(content: str) -> str:
+    """Return the text of :func:`sealed_text`; raise ``ValueError`` if it is damaged."""
+    text = content.partition("\n")[2]
+    if content != sealed_text(text):
+        raise ValueError("the SHA-256 differs")
+    return text
 
 
 def _digest(content: bytes) -> tuple[int, bytes]:

@@ -18,12 +18,12 @@ from impact_posture.collision import robot_shapes as collision_shapes
 from impact_posture.collision.mesh_check import MeshCheck
 from impact_posture.collision.robot_shapes import NO_SHAPES, RobotShapes, load_shapes
 from impact_posture.collision.swept_hull import distance_from_hull, obstacle_hull
-from impact_posture.config import cached_values
 from impact_posture.config.obstacle import Obstacle
 from impact_posture.config.table_validation import validate
 from impact_posture.errors import InputError, SpecError, UrdfError
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
+from impact_posture.system.sealed_files import sealed_text
 from tests.support.urdfs import joint, link, stl
 
 TETRAHEDRON = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])
@@ -255,8 +255,7 @@ def test_a_damaged_cache_is_fitted_again(tmp_path: Path, own_cache: Path, damage
         # The checksum is correct, but a field is missing.
         content = json.loads(raw.split(b"\n", 1)[1])
         del content["pairs"]
-        changed = json.dumps(content)
-        path.write_text(f"{cached_values._seal(changed)}\n{changed}")
+        path.write_text(sealed_text(json.dumps(content)))
     else:
         other = raw.replace(b'"radius":', b'"radius":1')
         assert other != raw
@@ -273,7 +272,7 @@ def test_a_cache_that_others_may_write_is_not_read(tmp_path: Path, own_cache: Pa
     content = json.loads(path.read_text().split("\n", 1)[1])
     content["bodies"][0]["radius"] = 0.5
     text = json.dumps(content)
-    path.write_text(f"{cached_values._seal(text)}\n{text}")
+    path.write_text(sealed_text(text))
     fresh()
     assert arm(tmp_path, BOX).bodies[0].radius == 0.5
     for place in (path, own_cache):
@@ -282,7 +281,7 @@ def test_a_cache_that_others_may_write_is_not_read(tmp_path: Path, own_cache: Pa
         fresh()
         assert arm(tmp_path, BOX).bodies[0].radius < 0.5
         place.chmod(mode)
-        path.write_text(f"{cached_values._seal(text)}\n{text}")
+        path.write_text(sealed_text(text))
 
 
 # ---- obstacles ----------------------------------------------------------------------------------------------------
