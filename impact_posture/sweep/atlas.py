@@ -176,26 +176,34 @@ def open_atlas(folder: str | Path) -> Dataset:
         SpecError: The folder is not a sweep folder, has no finished shard, or is damaged.
     """
     check_package("pyarrow", "sweep")
-    from pyarrow import ArrowException, dataset, fs
+    from pyarrow import dataset, fs
 
     manifest, data = read_manifest(Path(folder)), Path(folder) / _DATA
     paths = sorted(data.glob("case=*/shard-*.parquet"))
     if not paths:
         raise SpecError("has no finished shard", where=str(folder), hint="run sweep again to continue")
-    pages = dataset.ParquetFragmentScanOptions(page_checksum_verification=True)
-    partitions = dataset.FileSystemFactoryOptions(str(data), partitioning=dataset.HivePartitioning.discover())
-    try:
+    with reading(Path(folder)):
         for path in paths:
             open_regular(path).close()
         names = {path.relative_to(data).as_posix(): path for path in paths if manifest.has_checksums}
         damaged = [name for name, path in names.items() if not passes_of(read_bytes(path), manifest.key, name)]
         if damaged:
-            what, hint = f"has damaged shards ({listed(damaged)})", "run sweep again, which solves them again"
-            raise SpecError(what, where=str(folder), hint=hint)
+            hint = "run sweep again, which solves its shards again, and move files away that it did not write"
+            raise SpecError(f"has damaged shards ({listed(damaged)})", where=str(folder), hint=hint)
+        pages = dataset.ParquetFragmentScanOptions(page_checksum_verification=True)
         form = dataset.ParquetFileFormat(default_fragment_scan_options=pages)
-        return dataset.FileSystemDatasetFactory(
-            fs.LocalFileSystem(), list(map(str, paths)), form, partitions
-        ).finish()
+        by_case = dataset.HivePartitioning.discover()
+        options = dataset.FileSystemFactoryOptions(str(data), partitioning=by_case)
+        return dataset.FileSystemDatasetFactory(fs.LocalFileSystem(), list(map(str, paths)), form, options).finish()
+
+
+@contextmanager
+def reading(folder: Path) -> Iterator[None]:
+    """Convert errors of Parquet files that are read within the block to a SpecError about their folder."""
+    from pyarrow import ArrowException
+
+    try:
+        yield
     except (OSError, ArrowException) as error:
         raise SpecError(f"cannot be read ({error})", where=str(folder), hint="run sweep again") from None
 

@@ -21,7 +21,7 @@ from impact_posture.output.plot.style import GRAY, INK, PALE, VERMILLION, framed
 from impact_posture.posture.formulation.problem_file import prepare
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem
 from impact_posture.posture.search.multistart import wrapped_difference
-from impact_posture.sweep.atlas import open_atlas
+from impact_posture.sweep.atlas import open_atlas, reading
 from impact_posture.sweep.point_search import SWITCH
 from impact_posture.sweep.shard_table import STATUS
 from impact_posture.sweep.sweep_file import Axis, Grid
@@ -92,15 +92,17 @@ def draw_maps(
     problems = [prepare(setting).problem for setting in settings]
     across, upwards = _chosen(grid, axes)
     plane = _plane(grid, across, upwards)
-    counts = {status: data.count_rows(filter=compute.field("status") == status) for status in STATUS}
-    switches, best, files = 0, list[dict[str, Any]](), list[Path]()
-    with added_files(out, force=force) as beside:
-        for number, (case, problem) in enumerate(zip(manifest.cases, problems, strict=True)):
-            table = _Slice(data, plane + number * grid.size, problem)
-            switches += len(table.switches)
+    cases, best, files = manifest.cases, list[dict[str, Any]](), list[Path]()
+    with reading(folder):
+        counts = {status: data.count_rows(filter=compute.field("status") == status) for status in STATUS}
+        tables = [_Slice(data, plane + k * grid.size, problem) for k, problem in enumerate(problems)]
+        for number, case in enumerate(cases):
             best += _best(data, grid, number, case.values)
+    with added_files(out, force=force) as beside:
+        for number, (case, problem, table) in enumerate(zip(cases, problems, tables, strict=True)):
             path = beside / f"map-{number}"
             files += _draw(table, grid, (across, upwards), case.values, problem, path, formats)
+    switches = sum(len(table.switches) for table in tables)
     return Shown(manifest.points, counts, switches, best, [out / path.name for path in files])
 
 

@@ -26,7 +26,7 @@ _Values = tuple[_Number, ...] | tuple[tuple[_Number, ...], ...]
 _Count = Annotated[int, Demand(lambda count: count > 0, "a whole number above zero")]
 
 
-def _like(values: Any) -> bool:
+def _alike(values: Any) -> bool:
     """Return whether the values of an axis exist, and have the same number of entries."""
     return len({len(value) if isinstance(value, tuple) else 0 for value in values}) == 1
 
@@ -36,7 +36,7 @@ class ManifestAxis(StrictTable):
     """Axis of the grid: numbers, or vectors of equal length."""
 
     name: InnerAxis
-    values: Annotated[_Values, Demand(_like, "at least one value; all values with the same number of entries")]
+    values: Annotated[_Values, Demand(_alike, "at least one value; all values with the same number of entries")]
 
 
 @dataclass(frozen=True)

@@ -183,7 +183,8 @@ def test_the_command_names_damaged_files(solved: tuple[Sweep, str, Path], tmp_pa
     shown = run("sweep", "show", "out", cwd=tmp_path)
     assert shown.returncode == 1
     assert shown.stderr == (
-        "error: out: has damaged shards (case=0/shard-000001.parquet); run sweep again, which solves them again\n"
+        "error: out: has damaged shards (case=0/shard-000001.parquet); "
+        "run sweep again, which solves its shards again, and move files away that it did not write\n"
     )
     again = run("sweep", "sweep.toml", "--out", "out", "--workers", "1", cwd=tmp_path)
     warning = "warning: data/case=0/shard-000001.parquet was damaged or of another sweep, and was written again\n"
@@ -264,6 +265,11 @@ def test_folders_without_checksums_are_still_read(solved: tuple[Sweep, str, Path
     for shard in shards(tmp_path / "out"):
         shard.write_bytes(rewrite(shard.read_bytes(), lambda table: table.replace_schema_metadata({"sweep": "key"})))
     assert ip.sweep.open(tmp_path / "out").count_rows() == 8
+    first = shards(tmp_path / "out")[0]
+    content = first.read_bytes()
+    first.write_bytes(content[:4] + bytes(400) + content[404:])
+    with pytest.raises(SpecError, match="cannot be read"):
+        draw_maps(tmp_path / "out", tmp_path / "maps")
 
 
 def test_a_pipe_in_the_place_of_a_shard(solved: tuple[Sweep, str, Path], tmp_path: Path) -> None:
