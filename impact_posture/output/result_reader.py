@@ -118,7 +118,10 @@ def _refuse_constant(text: str) -> None:
 
 
 def _broken(folder: Path, error: Exception) -> SpecError:
-    what = f"is not a whole result ({type(error).__name__}: {error})"
+    reason = f"{type(error).__name__}: {error}"
+    if isinstance(error, OSError) and error.filename:
+        reason = f"{Path(error.filename).name}: {error.strerror}"
+    what = f"is not a whole result ({reason})"
     return SpecError(what, where=str(folder), hint="run optimize again")
 
 

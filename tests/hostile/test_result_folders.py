@@ -95,6 +95,8 @@ def test_pipes_in_a_result(file: str, result: Path, arena: Path) -> None:
     for command in (("plot", "out"), ("report", "out"), ("codegen", "out", *STOP), ("verify", "out")):
         outcome = strike(arena, *command)
         assert (outcome.code, outcome.complaints) == (1, []), (command, outcome.err)
+        # A folder without result.json is not a result.
+        assert (file in outcome.err or file == "result.json") and "Errno" not in outcome.err
 
 
 MAP = {
