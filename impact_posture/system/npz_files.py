@@ -62,8 +62,8 @@ def fitting_arrays(
         arrays: Arrays of a file.
         prefix: First characters of the names in the file.
         shapes: Name → kind of the numbers and names of the dimensions, such as ``"real n nq"``.  Equal names of
-            dimensions have equal sizes.  The kinds are ``real`` (finite), ``float`` (also NaN), ``bool``, and
-            ``index``, an index along the dimension ``n``.
+            dimensions have equal sizes.  The kinds are ``real`` (finite), ``float`` (also NaN or inf), ``bool``,
+            and ``index``, an index along the dimension ``n``.
         sizes: Known sizes of dimensions.
 
     Raises:
@@ -80,7 +80,7 @@ def fitting_arrays(
         fits = fits and array.dtype.kind in {"bool": "b", "index": "iu"}.get(kind, "fiu")
         if fits and kind in ("real", "float"):
             limited = np.abs(array) <= _LARGEST
-            fits = bool((limited if kind == "real" else limited | np.isnan(array)).all())
+            fits = bool((limited if kind == "real" else limited | ~np.isfinite(array)).all())
         elif fits and kind == "index":
             fits = 0 <= array.min() and array.max() < sizes["n"]
         if not fits:

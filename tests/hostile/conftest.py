@@ -2,13 +2,13 @@
 
 A test counts the inputs that it gives to ``strike``, ``attack`` or ``judging``; a test without these counts as one
 input.  A failing test has at least one mishandled input.  ``--hostile-table`` writes the counts into
-docs/generated/hostile.md.
+docs/generated/hostile.md, and keeps the rows of test files that did not run.
 """
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -47,30 +47,41 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
     reports = [report for reports in terminalreporter.stats.values() for report in reports]
-    lines = table([report for report in reports if isinstance(report, pytest.TestReport)])
-    if lines:
-        terminalreporter.line(f"hostile inputs {lines[-1]}")
+    rows = counted([report for report in reports if isinstance(report, pytest.TestReport)])
+    if rows:
+        terminalreporter.line(f"hostile inputs {table(rows)[-1]}")
     if config.getoption("--hostile-table", default=False):
-        PAGE.write_text("\n".join([HEAD, "", *lines, ""]), encoding="utf-8")
+        before = PAGE.read_text(encoding="utf-8").splitlines() if PAGE.is_file() else []
+        cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in before if line.startswith("| ")]
+        kept = {name: Row(about, int(tried), int(bad)) for name, about, tried, bad in cells[1:-1]}
+        PAGE.write_text("\n".join([HEAD, "", *table(kept | rows), ""]), encoding="utf-8")
 
 
-def table(reports: list[pytest.TestReport]) -> list[str]:
-    """Return the lines of the page: skipped tests, and the tried and mishandled inputs of each test file."""
-    abouts: dict[str, str] = {}
-    counts: dict[str, list[int]] = defaultdict(lambda: [0, 0])
+@dataclass
+class Row:
+    """Row of the table: subject of a test file, and its tried and mishandled inputs."""
+
+    about: str
+    tried: int = 0
+    mishandled: int = 0
+
+
+def counted(reports: list[pytest.TestReport]) -> dict[str, Row]:
+    """Return the row of each test file that ran."""
+    rows: dict[str, Row] = {}
     for report in reports:
         name = Path(report.location[0]).stem.removeprefix("test_").replace("_", " ")
         for about, tried, mishandled in (value for key, value in report.user_properties if key == "hostile"):
-            abouts[name] = about.rstrip(".")
-            counts[name] = [counts[name][0] + tried, counts[name][1] + mishandled]
-    if not counts:
-        return []
-    skips = [report for report in reports if report.skipped and "hostile/" in report.nodeid]
-    reasons = sorted({str(report.longrepr[2]).removeprefix("Skipped: ") for report in skips if report.longrepr})
-    lines = [f"Skipped: {'; '.join(reasons)}.", ""] if reasons else []
-    lines += ["| inputs | what is tested | tried | mishandled |", "|---|---|---|---|"]
-    lines += [f"| {name} | {abouts[name]} | {counts[name][0]} | {counts[name][1]} |" for name in sorted(counts)]
-    tried, mishandled = (sum(column) for column in zip(*counts.values(), strict=True))
+            row = rows.setdefault(name, Row(about.rstrip(".")))
+            row.tried, row.mishandled = row.tried + tried, row.mishandled + mishandled
+    return rows
+
+
+def table(rows: dict[str, Row]) -> list[str]:
+    """Return the lines of a table with all rows and their sums."""
+    lines = ["| inputs | what is tested | tried | mishandled |", "|---|---|---|---|"]
+    lines += [f"| {name} | {row.about} | {row.tried} | {row.mishandled} |" for name, row in sorted(rows.items())]
+    tried, mishandled = (sum(getattr(row, key) for row in rows.values()) for key in ("tried", "mishandled"))
     return [*lines, f"| all | | {tried} | {mishandled} |"]
 
 

@@ -96,7 +96,8 @@ def test_a_result_with_a_posture_of_another_length(tmp_path: Path, size: int) ->
     (tmp_path / "result.json").write_text(
         json.dumps({"schema": SCHEMA, "robot": {"model_sha256": robot.model_sha256}, **q})
     )
-    path = {f"path_{key}": np.zeros(1) for key in ("q", "s", "H", "G", "V", "S", "objective")}
+    path = {f"path_{key}": np.zeros(1) for key in ("s", "H", "G", "V", "S", "objective")}
+    path["path_q"] = robot.posture()[None]
     np.savez(tmp_path / "result.npz", **path)
     with pytest.raises(PostureError, match=rf"optimal\.q: a posture of tilthex_arm has .* numbers, this one {size}"):
         load_view(tmp_path)
