@@ -11,6 +11,7 @@ from impact_posture.dynamics.numeric import Numeric
 from impact_posture.impact.impact_contact import point_on
 from impact_posture.impact.worst_case.worst_normal import cone_axes
 from impact_posture.path.path_space import PathSpace
+from impact_posture.posture.constraints.center_of_mass_over_feet import CenterOfMassOverFeet
 from impact_posture.posture.constraints.clearance import Clearance
 from impact_posture.posture.constraints.pose_constraints import (
     AxisInCone,
@@ -20,12 +21,15 @@ from impact_posture.posture.constraints.pose_constraints import (
     HeldTurn,
     PositionAlong,
 )
+from impact_posture.posture.loads.holdable import Holdable, ReachableWrench
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem, equality_jacobian
 from impact_posture.system.arrays import Array
 
 # After the impact, the contact point may be this far inside the surface, m, because it may slide along the surface.
 _PRESSED = 1e-4
 _POSES = (HeldPose, HeldPosition, HeldOrientation, AxisInCone)
+# Constraints on a robot at rest, which the limits on the load of a motion replace.
+_AT_REST = (CenterOfMassOverFeet, Holdable, ReachableWrench)
 
 
 class StrikeSpaces:
@@ -37,7 +41,8 @@ class StrikeSpaces:
         normal: Normal of the surface at ``q``, world axes, shape (3,).
         approach: Postures on the way to the run-up.  The orientation of the contact frame is held as at the optimum.
         run_up: Postures of the run-up.  In addition, the contact point is on the normal through its place at ``q``.
-        rebound: Postures after the impact, which moves all frames except the feet.
+        rebound: Postures after the impact, which moves all frames except the feet.  The center of mass may leave the
+            feet while the robot moves, and the joint limits have no margin.
 
     Args:
         turns: Whether the contact frame may turn in the run-up.
@@ -69,12 +74,19 @@ class StrikeSpaces:
         contact_at = self._point, at.translation
         above = PositionAlong("contact above the surface", *contact_at, self.normal[None], 0.0, np.inf)
         line = PositionAlong("contact on the normal", *contact_at, tangents, 0.0, 0.0)
-        poses = _POSES if first else (*_POSES, HeldTurn)
-        struck = [c for k, c in enumerate(rest) if k < first or not isinstance(c, poses)]
+        dropped = (*_POSES, *_AT_REST) if first else (*_POSES, *_AT_REST, HeldTurn)
+        struck = [c for k, c in enumerate(rest) if k < first or not isinstance(c, dropped)]
         pressed = PositionAlong(above.name, *contact_at, self.normal[None], -_PRESSED, np.inf)
+        # The stop may use the margin of the joint limits.
+        margin = np.where(problem.lower < problem.upper, problem.requirements.limit_margin, 0.0)
+        wide = replace(problem, lower=problem.lower - margin, upper=problem.upper + margin)
         self.approach, self.run_up, self.rebound = (
-            PathSpace(replace(problem, constraints=tuple(constraints), rows=()))
-            for constraints in ([*rest, *turned, above], [*rest, *turned, above, line], [*struck, pressed])
+            PathSpace(replace(limited, constraints=tuple(constraints), rows=()))
+            for limited, constraints in (
+                (problem, [*rest, *turned, above]),
+                (problem, [*rest, *turned, above, line]),
+                (wide, [*struck, pressed]),
+            )
         )
 
     def contact_velocity(self, model: Numeric, velocity: Array) -> Array:
