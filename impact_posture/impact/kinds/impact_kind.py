@@ -29,7 +29,7 @@ from impact_posture.system.arrays import Array
 
 @dataclass(frozen=True)
 class ImpactKind(ABC):
-    """Objective type: a multiple of H, V, S, C or E for a single impact along a given normal.
+    """Objective type: a multiple of H, V, S, C, E or m for a single impact along a given normal.
 
     The class implements :class:`~impact_posture.impact.objective.WorstCase` without computing a maximum: the
     largest impulse ``λ̄`` is the worst, or the approach speed determines the impulse.  :attr:`symbol` names the
@@ -38,7 +38,7 @@ class ImpactKind(ABC):
 
     Attributes:
         name: Name in options, files and outputs.
-        symbol: Symbol of the scalar: H, V, S, C or E.
+        symbol: Symbol of the scalar: H, V, S, C, E or m.
         units: Units of the value, as text.
         adds_up: Whether the impulse of each contact is given, so that the velocity jumps of several contacts add up.
         kink: Text that states where the gradient is discontinuous, and which gradient is returned there; empty if
