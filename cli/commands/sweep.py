@@ -100,8 +100,8 @@ def sweep(
         return
     solved = sum(run.counts.values())
     page.title(path.name, f"{run.points} problems, {solved} solved now")
-    page.table(("status", "problems"), [(k, str(v)) for k, v in run.counts.items() if v], right=(1,))
     if solved:
+        page.table(("status", "problems"), [(k, str(v)) for k, v in run.counts.items() if v], right=(1,))
         page.line(
             f"{number(1e3 * run.total_s / solved, 'ms')} of a worker's time for each problem, "
             f"{100 * run.solver_s / max(run.total_s, 1e-9):.0f} % of it in the solver"

@@ -58,8 +58,9 @@ class JobStore:
                 except _BROKEN as error:
                     if not self._used:
                         raise
-                    what = f"contains a run that was changed ({type(error).__name__}: {error})"
-                    raise OutputError(what, where=str(self.folder), hint="delete this folder") from error
+                    what = f"contains runs that cannot be used ({type(error).__name__}: {error})"
+                    hint = "delete this folder, and report the error if it comes again"
+                    raise OutputError(what, where=str(self.folder), hint=hint) from error
 
     def _make_folder(self) -> None:
         try:
