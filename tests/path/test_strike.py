@@ -27,7 +27,9 @@ from impact_posture.path.posture_path import PosturePath, posture_path
 from impact_posture.path.row_interpolation import RowInterpolation
 from impact_posture.path.strike import StrikeSpaces, check_strike, impact_velocity
 from impact_posture.path.stroke import _SHARE
+from impact_posture.posture.approach.approach_speed import ApproachSpeed
 from impact_posture.posture.constraints.clearance import Clearance
+from impact_posture.posture.constraints.impact_bounds import ImpactBounds
 from impact_posture.posture.constraints.pose_constraints import PositionAlong
 from impact_posture.posture.constraints.requirements import Requirements
 from impact_posture.posture.formulation.build_problem import build_problem
@@ -36,7 +38,8 @@ from impact_posture.posture.program.constrained_problem import ConstrainedProble
 from impact_posture.posture.search.multistart import PostureSolution, solve
 from impact_posture.system.arrays import Array
 from tests.support.command import run
-from tests.support.helpers import robot
+from tests.support.constraints import check_expression
+from tests.support.helpers import rng, robot
 from tests.support.settings import make_settings
 from tests.support.urdfs import joint, link, load, write
 
@@ -183,16 +186,22 @@ def test_a_motor_that_cannot_move_the_cart_ends_the_path_at_rest(tmp_path: Path)
     assert path.strike is None and len(path.t) == 1
 
 
-def test_directions_of_a_position_have_the_derivative_of_finite_differences() -> None:
-    loaded, h = robot("panda"), 1e-6
-    q, D = loaded.posture() + 0.1, np.random.default_rng(1).normal(size=(2, 3))
-    row = PositionAlong("along", point_on(loaded, "panda_hand_tcp", (0.01, 0.02, 0.03)), np.ones(3), D, 0.0, 1.0)
-    numeric = Numeric(loaded.model)
-    J = row.evaluate(numeric.at(q))[1]
-    steps = [h * unit for unit in np.eye(loaded.nv)]
-    moved = [row.value(numeric.at(pin.integrate(loaded.model, q, step))) for step in steps]
-    back = [row.value(numeric.at(pin.integrate(loaded.model, q, -step))) for step in steps]
-    np.testing.assert_allclose(J, (np.array(moved) - back).T / (2 * h), atol=1e-8)
+def test_positions_along_directions_agree_with_casadi_and_finite_differences() -> None:
+    loaded = robot("panda")
+    directions, point = rng("directions").normal(size=(2, 3)), point_on(loaded, "panda_hand_tcp", (0.01, 0.02, 0.03))
+    row = PositionAlong("along", point, np.ones(3), directions, 0.0, 1.0)
+    check_expression(row, loaded.model, [loaded.posture(), loaded.posture() + 0.1])
+
+
+def test_constraints_on_the_impact_do_not_hold_on_the_way() -> None:
+    task: dict[str, object] = {**CASES["ur5"], "speed": 0.5, "max_joint_jump": 9.0}
+    problem = prepare(make_settings(task)).problem
+    at_impact = [c for c in problem.constraints if c.at_impact]
+    assert [type(c) for c in at_impact] == [ImpactBounds, ApproachSpeed]
+    spaces = StrikeSpaces(problem, problem.given)
+    for space in (spaces.approach, spaces.run_up, spaces.rebound):
+        assert not {id(c) for c in at_impact} & {id(c) for c in space.problem.constraints}
+        assert any(isinstance(c, Clearance) for c in space.problem.constraints)
 
 
 def test_the_surface_stays_in_the_world_while_the_contact_backs_off() -> None:
