@@ -53,7 +53,11 @@ def sha256_of(path: Path) -> str:
 
 def typed_command(folder: Path) -> str:
     """Return the command line that wrote an output folder; empty if another program wrote the folder."""
-    return str((read_record(folder) or {}).get("command", ""))
+    try:
+        # Until a folder is complete, its record lists no files, and read_record returns None.
+        return str(json.loads(read_text(folder / RECORD)).get("command", ""))
+    except (OSError, ValueError, AttributeError, RecursionError):
+        return ""
 
 
 def own_files(folder: Path, kind: Kind) -> list[str]:
