@@ -103,27 +103,24 @@ def follow_through(
         tilted = axes @ [np.cos(cone), np.sin(cone) * np.cos(angle), np.sin(cone) * np.sin(angle)]
         around[f", normal {k + 1} on the edge of the cone"] = StrikeSpaces(problem, q, normal=tilted)
     spread = product(RESTITUTIONS, FACTORS, around.items())
-    impacts = {
+    impacts = {"the predicted impact": (spaces, 1.0, restitution)} | {
         f"restitution {e:g}, {factor:.0%} of the speed{where}": (at, factor, e) for e, factor, (where, at) in spread
     }
-    impacts = {"the predicted impact": (spaces, 1.0, restitution), **impacts}
-    after = {name: after_impact(problem, at, q, factor * velocity, e) for name, (at, factor, e) in impacts.items()}
-    stops, hindrance, rows = list[_Stop](), "", None
-    for name, (at, *_) in impacts.items():
-        state = after[name]
+    predicted, rows, stops, hindrance = velocity, None, list[_Stop](), ""
+    for k, (name, (at, factor, e)) in enumerate(impacts.items()):
+        state = after_impact(problem, at, q, factor * velocity, e)
         stop = "no impulse is known" if state is None else _stop(at, q, state, limits)
+        predicted = state if k == 0 and state is not None else predicted
         if isinstance(stop, str):
             hindrance = hindrance or f"{stop}, after {name}"
             continue
         stops.append(_Stop(name, *stop))
-    if stops and stops[0].name == next(iter(impacts)):
-        stroke, duration = stops[0].stroke, stops[0].duration
-        assert stroke.curve is not None  # noqa: S101 (narrows a type)
-        rows = sampled(spaces.rebound, stroke.curve, limits, stroke.law(duration), "").rows
+        stroke, duration = stop
+        if k == 0 and stroke.curve is not None:
+            rows = sampled(spaces.rebound, stroke.curve, limits, stroke.law(duration), "").rows
     near = [room for stop in stops for room in stop.rooms(spaces.rebound)]
-    predicted = next(iter(after.values()))
     return FollowThrough(
-        velocity if predicted is None else predicted,
+        predicted,
         rows,
         len(impacts),
         len(stops),

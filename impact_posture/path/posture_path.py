@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 
@@ -197,14 +198,8 @@ def _struck(
     effort: int,
 ) -> PosturePath | str:
     """Return the path that strikes the first optimum with the stated or else the greatest speed; or why none does."""
-    start, objective = solution.initial, solution.problem.objective
-    others = [o.q for o in solution.optima if not np.array_equal(o.q, solution.q)]
-    runs: list[tuple[int, RunUp]] = []
-    first = ""
-    for k, q in enumerate([solution.q, *others[: _OPTIMA - 1]]):
-        target = space.pulled(space.unwound(start, q))
-        if target is None or (k and objective.value(target) >= objective.value(start)):
-            continue
+    start, runs, first = solution.initial, list[tuple[int, RunUp]](), ""
+    for k, target in _targets(solution, space):
         run = run_up(solution.problem, target, speed, limits)
         if isinstance(run, str):
             first = first or run
@@ -255,21 +250,27 @@ def _still(space: PathSpace, objective: Objective, q: Array, failure: str, *note
     return PosturePath(not failure, reason, "", "", value, np.zeros(1), q[None], rest, rest, 0.0, space.worst(q))
 
 
+def _targets(solution: PostureSolution, space: PathSpace) -> Iterator[tuple[int, Array]]:
+    """Yield the numbers of the optima to try, best first, and their postures on the constraints."""
+    value, start = solution.problem.objective.value, solution.initial
+    others = [o.q for o in solution.optima if not np.array_equal(o.q, solution.q)]
+    for k, q in enumerate([solution.q, *others[: _OPTIMA - 1]]):
+        target = space.pulled(space.unwound(start, q))
+        if target is not None and (not k or value(target) < value(start)):
+            yield k, target
+
+
 def _reached(solution: PostureSolution, space: PathSpace, seed: int, effort: int) -> tuple[Connection, str]:
     """Return the path to the optimum, or the path to the best reached posture and the reason."""
     start, objective = solution.initial, solution.problem.objective
     curve = ReachableCurve.of(space, start)
-    others = [o.q for o in solution.optima if not np.array_equal(o.q, solution.q)]
     stay = connection = Connection([start], [start], "")
     end, proof, reached = "", "", [start]
 
     def connect_to(target: Array) -> Connection:
         return curve.connect(target) if curve else connect(space, start, target, seed, effort)
 
-    for k, q in enumerate([solution.q, *others[: _OPTIMA - 1]]):
-        target = space.pulled(space.unwound(start, q))
-        if target is None or (k and objective.value(target) >= objective.value(start)):
-            continue
+    for k, target in _targets(solution, space):
         connection = connect_to(target)
         reached += connection.reached
         proof = proof if k else connection.proof
