@@ -11,7 +11,7 @@ from impact_posture.codegen.compile_and_check import compile_and_check
 from impact_posture.codegen.export import Export, default_prefix
 from impact_posture.codegen.manifest_builder import build_manifest
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
-from impact_posture.system.folder_record import own_files
+from impact_posture.system.folder_record import changed_files, own_files
 from impact_posture.system.libraries import library_path
 from impact_posture.system.text_files import read_text
 from impact_posture.system.toolchain import find_compiler
@@ -21,7 +21,7 @@ _OTHERS = ("posture", "compression", "stack_bytes")
 
 
 def existing_export(objective: WorstCaseObjective, out: Path, *, build: bool) -> Export | None:
-    """Return the export of an objective in the folder ``out``; return ``None`` if the folder has no such export.
+    """Return the unchanged export of an objective in the folder ``out``; ``None`` if there is no such export.
 
     The manifest can state any posture and compression of the impact.  All other content must equal the manifest that
     :func:`~impact_posture.codegen.export.export` would write.  If ``build`` is true, the library is built and
@@ -32,7 +32,7 @@ def existing_export(objective: WorstCaseObjective, out: Path, *, build: bool) ->
     """
     prefix = default_prefix([objective])
     files = own_files(out, "export")
-    if f"{prefix}.json" not in files or not all((out / name).is_file() for name in files):
+    if f"{prefix}.json" not in files or not all((out / name).is_file() for name in files) or changed_files(out):
         return None
     try:
         manifest = json.loads(read_text(out / f"{prefix}.json"))

@@ -236,7 +236,12 @@ def test_the_code_of_a_result_is_the_code_of_its_objective(result: ip.PostureRes
         with pytest.raises(OutputError, match="exists"):
             objective.export(folder)
     manifest.write_bytes(before[manifest.name])
-    (folder / "tilthex_arm_ee.c").unlink()
+    assert objective.export(folder, build=False).manifest == written.manifest
+    source = folder / "tilthex_arm_ee.c"
+    source.write_bytes(before[source.name] + b"/* an edit */\n")
+    with pytest.raises(OutputError, match=f"changes of yours in {source.name}"):
+        objective.export(folder)
+    source.unlink()
     with pytest.raises(OutputError, match="exists"):
         objective.export(folder)
 
