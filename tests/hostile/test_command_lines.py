@@ -58,7 +58,7 @@ def spoil(command: str, rng: random.Random) -> tuple[str, ...]:
 def test_values_that_make_no_sense(command: str, arena: Path, hostile_full: bool) -> None:
     rng = random.Random(command)
     stops = SOUND[command][-3:] == STOP
-    cases = [spoil(command, rng) for _ in range(COUNT * (20 if hostile_full else 1))]
+    cases = [(command, *SOUND[command]), *(spoil(command, rng) for _ in range(COUNT * (20 if hostile_full else 1)))]
     # If the option `--out` is given twice, the last value applies.
     outcomes = attack([(*case, *STOP) if stops else case for case in cases], arena)
     assert len({outcome.code for outcome in outcomes}) > 1
