@@ -62,7 +62,7 @@ class _Packages:
         with suppress(LookupError):  # ROS raises this error for an unknown package.
             if self._ros is not None:
                 return str(self._ros.get_package_share_directory(package))
-        near = sorted(entry.name for place in self._places[:3] if place.is_dir() for entry in place.iterdir())
+        near = sorted(entry.name for place in self._places[:3] for entry in place.glob("[!.]*/"))
         hint = "name the folder above it with `package_dir`"
         raise PackageNotFound(package, near, where=str(self._path), hint=hint)
 
