@@ -35,6 +35,8 @@ _MAP = {
     "q": "real n nq", "component": "index n", "s": "real n", "objective": "float n", "feasible": "bool n",
     "start": "index one", "optimum": "index one", "ends": "index optima",
 }  # fmt: skip
+# Whole numbers with fewer digits can be converted to a float.
+_DIGITS = 300
 # Exceptions that a changed or incomplete result can cause.
 _BROKEN = (LookupError, ValueError, TypeError, AttributeError, OSError, RecursionError)
 
@@ -89,7 +91,7 @@ def load_result(folder: Path) -> tuple[Prepared, ResultView, dict[str, Any]]:
     if not os.path.isfile(folder / "result.json"):
         raise SpecError("holds no result.json", where=str(folder), hint="name a folder that optimize wrote")
     try:
-        document = json.loads(read_text(folder / "result.json"), parse_constant=_refuse_constant)
+        document = json.loads(read_text(folder / "result.json"), parse_constant=_refuse, parse_int=_whole)
         if document["schema"] != SCHEMA:
             fault = f"schema '{shown(document['schema'])}'"
             raise SpecError(fault, where=str(folder / "result.json"), hint="run optimize again")
@@ -113,8 +115,13 @@ def load_result(folder: Path) -> tuple[Prepared, ResultView, dict[str, Any]]:
         raise _broken(folder, error) from None
 
 
-def _refuse_constant(text: str) -> None:
-    raise ValueError(f"{text} is not a JSON number")
+def _refuse(text: str) -> int:
+    raise ValueError(f"{shown(text)} is not a number of a result")
+
+
+def _whole(text: str) -> int:
+    """Return a whole number that a float can hold."""
+    return int(text) if len(text) < _DIGITS else _refuse(text)
 
 
 def _broken(folder: Path, error: Exception) -> SpecError:

@@ -73,8 +73,9 @@ def spoil_entries(folder: Path, rng: random.Random) -> None:
         ("schema", "impact-posture/result/2", "result/2"),
         ("schema", ["a"] * 10_000, "schema"),
         ("H", float("nan"), "NaN"),
+        ("q", [10**400, 0], "not a number"),
     ],
-    ids=["schema", "list", "nan"],
+    ids=["schema", "list", "nan", "huge"],
 )
 def test_results_of_another_version(key: str, value: object, words: str, result: Path, arena: Path) -> None:
     shutil.copytree(result, arena / "out")
