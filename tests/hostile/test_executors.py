@@ -105,18 +105,20 @@ def interrupted(words: list[str], out: Path, harm: Callable[[int], None], **more
     end = time.monotonic() + 120
     while not list(out.rglob("*.parquet")) and process.poll() is None and time.monotonic() < end:
         time.sleep(0.02)
-    harm(process.pid)
-    texts = process.communicate(timeout=240)
+    try:
+        harm(process.pid)
+        texts = process.communicate(timeout=240)
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
     return Outcome(tuple(words), process.returncode, *texts, ())
 
 
 def check(outcome: Outcome, sweep: Path, out: Path) -> None:
     """Check the outcome, and that another run on this machine continues with the same bytes."""
     assert not outcome.complaints, (outcome.complaints, outcome.err)
-    assert (
-        subprocess.run([*COMMAND, "sweep", str(sweep), "--workers", "1", "--quiet", "--out", str(out)]).returncode
-        == 0
-    )
+    again = subprocess.run([*COMMAND, "sweep", str(sweep), "--workers", "1", "--quiet", "--out", str(out)])
+    assert again.returncode == 0
     run_sweep(read_sweep(sweep), sweep.with_name("whole"))
     assert shards(out) == shards(sweep.with_name("whole"))
 
