@@ -14,6 +14,7 @@ from impact_posture.config.demand import Positive
 from impact_posture.config.problem_settings import MetricKind
 from impact_posture.config.table_validation import read_toml
 from impact_posture.errors import MetricError
+from impact_posture.impact.impact_contact import LARGEST
 from impact_posture.robot.model_joints import v_slice
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
@@ -58,7 +59,7 @@ def build_metric(robot: Robot, kind: MetricKind, weights: str | tuple[float, ...
     file has lines ``joint = weight``, and ``base = [6 numbers]`` for a floating base.
 
     Raises:
-        MetricError: Weights are missing, wrong in number, not above zero, or given for another metric.
+        MetricError: Weights are missing, wrong in number, not between 1e-100 and 1e100, or given for another metric.
     """
     if kind != "weighted":
         if weights is not None and kind in get_args(MetricKind):
@@ -77,8 +78,9 @@ def build_metric(robot: Robot, kind: MetricKind, weights: str | tuple[float, ...
     else:
         values = _from_file(robot, Path(weights))
     for name, value in zip(robot.tangent_names, values, strict=True):
-        if not (np.isfinite(value) and value > 0):
-            what, hint = f"the weight of '{name}' is {value:g}", "every weight must be above zero"
+        if not 1 / LARGEST <= value <= LARGEST:
+            what = f"the weight of '{name}' is {value:g}"
+            hint = f"every weight must be above zero: {1 / LARGEST:g} to {LARGEST:g}"
             raise MetricError(what, where=source, hint=hint)
     return Metric("weighted", tuple(float(v) for v in values), source)
 

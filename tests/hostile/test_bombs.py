@@ -47,6 +47,12 @@ FILES = {
         ("evaluate", *PUSH, "--metric", "weighted", "--weights"),
         "not a number",
     ),
+    "weight whose ellipsoid overflows": (
+        "w.toml",
+        "shoulder = 0.1\nelbow = 1e308\n",
+        ("evaluate", *PUSH, "--metric", "weighted", "--weights"),
+        "every weight must be above zero",
+    ),
     "armature without end": ("w.toml", f"shoulder = {'1' * 400}\n", ("evaluate", *PUSH, "--armature"), "table"),
 }  # fmt: skip
 
