@@ -44,7 +44,8 @@ class FollowThrough:
     """The stop after the predicted impact, and the room that stops after all considered impacts leave.
 
     Attributes:
-        velocity: Predicted generalized velocity after the impact, ``ν + Δν``, shape (nv,).
+        velocity: Predicted generalized velocity after the impact, ``ν + Δν``, shape (nv,).  It is ``ν`` if no impulse
+            is known.
         rows: The motion from this velocity to rest; ``None`` if it does not exist.
         impacts: Number of impacts: the predicted one, and each restitution in :data:`RESTITUTIONS` with each factor
             in :data:`FACTORS` on the velocity before the impact, for the normal and for normals on the edge of the
