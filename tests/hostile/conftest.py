@@ -50,7 +50,8 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
     rows = counted([report for report in reports if isinstance(report, pytest.TestReport)])
     if rows:
         terminalreporter.line(f"hostile inputs {table(rows)[-1]}")
-    if config.getoption("--hostile-table", default=False):
+    # Workers of pytest-xdist know only their part of the tests.
+    if config.getoption("--hostile-table", default=False) and not hasattr(config, "workerinput"):
         before = PAGE.read_text(encoding="utf-8").splitlines() if PAGE.is_file() else []
         cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in before if line.startswith("| ")]
         kept = {name: Row(about, int(tried), int(bad)) for name, about, tried, bad in cells[1:-1]}
