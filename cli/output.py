@@ -30,13 +30,15 @@ def as_options(text: str) -> str:
     """Replace each parameter name in backquotes by its option, for example ```out``` by ``--out``.
 
     If the subcommand has no such option, the parameter is the key of a file, and the name is printed in quotes.
+    After "optimize again with", the name is an option of ``optimize``.
     """
 
     def name(match: re.Match[str]) -> str:
-        option = f"--{'no-' if match[1] else ''}{match[2].replace('_', '-')}"
-        return option if not _OPTIONS or option in _OPTIONS else f"{match[1] or ''}'{match[2]}'"
+        again, no = match[1] or "", match[2] or ""
+        option = f"--{'no-' if no else ''}{match[3].replace('_', '-')}"
+        return again + (option if again or not _OPTIONS or option in _OPTIONS else f"{no}'{match[3]}'")
 
-    return re.sub(r"(no )?`(\w+)`", name, text)
+    return re.sub(r"(optimize again with )?(no )?`(\w+)`", name, text)
 
 
 def print_json(document: object) -> None:

@@ -96,7 +96,11 @@ def test_resolved_settings_are_the_same_problem(more: dict[str, object], tmp_pat
     assert again.problem.objective.value(q) == first.problem.objective.value(q)
 
 
-def test_parameters_in_messages_are_printed_as_options() -> None:
+def test_parameters_in_messages_are_printed_as_options(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("impact_posture_cli.output._OPTIONS", set())
     assert as_options("give `support` a, no `support`, or `normal_cone` 0") == (
         "give --support a, --no-support, or --normal-cone 0"
     )
+    monkeypatch.setattr("impact_posture_cli.output._OPTIONS", {"--out"})
+    assert as_options("give `out` or `speed`") == "give --out or 'speed'"
+    assert as_options("run optimize again with `path`") == "run optimize again with --path"
