@@ -146,7 +146,7 @@ class Cupy:
 
 
 def test_arrays_on_a_gpu_call_the_kernels(sample: Sample, monkeypatch: pytest.MonkeyPatch) -> None:
-    """There is no GPU here: the kernels run as C++, and CuPy is replaced by NumPy."""
+    """Run the kernels as C++ and NumPy in place of CuPy, because machines of tests seldom have a GPU."""
     fake = Cupy()
     fake.library = on_host(sample.written, [sample.objective])
     monkeypatch.setitem(sys.modules, "cupy", fake)
