@@ -25,6 +25,8 @@ def prepare() -> None:
     os.umask(os.umask(0o077) & 0o077)
     # Always use the file backend, because a notebook backend or a missing backend in the environment would fail.
     os.environ["MPLBACKEND"] = "agg"
+    # NumPy and Matplotlib fail if the date of a reproducible build is not a number.  No output contains a date.
+    os.environ.pop("SOURCE_DATE_EPOCH", None)
     # Rich makes lines of this width, which fill the memory if it is huge, and are empty if it is zero.
     if not re.fullmatch(r"[1-9]\d{0,3}", os.environ.get("COLUMNS", "80")):
         del os.environ["COLUMNS"]

@@ -91,7 +91,9 @@ def test_the_backend_of_a_notebook_is_not_ours() -> None:
 
 def test_pictures_whatever_the_backend_and_without_noise(tmp_path: Path) -> None:
     nothing = "/proc/nothing"
-    settings = {"MPLBACKEND": "nonsense", "MPLCONFIGDIR": nothing, "HOME": nothing, "XDG_CACHE_HOME": ""}
+    # NumPy and Matplotlib read the date of a reproducible build.
+    settings = {"MPLBACKEND": "nonsense", "SOURCE_DATE_EPOCH": "abc"}
+    settings |= {"MPLCONFIGDIR": nothing, "HOME": nothing, "XDG_CACHE_HOME": ""}
     (tmp_path / "temporary").mkdir()
     done = subprocess.run(
         [COMMAND, "optimize", *PUSH, "--starts", "1", "--no-codegen", "--format", "svg", "--out", "out"],
