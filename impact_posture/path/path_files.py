@@ -43,12 +43,11 @@ def write_path(folder: Path, robot: Robot, path: PosturePath) -> None:
     """
     use = {} if path.use is None else {name: getattr(path.use, name) for name in _SHARES}
     arrays = {"objective": path.objectives, **{f"share_{name}": values for name, values in use.items()}}
-    rows, strike = RowInterpolation(robot.model, path.t, path.q, path.v, path.a), path.strike
-    if strike is None:
-        _write_rows(folder / "path", robot, rows, arrays)
+    if (strike := path.strike) is None:
+        _write_rows(folder / "path", robot, path, arrays)
         return
     note = f"# The contact is at the last point, at {strike.contact_s:.9g} s."
-    _write_rows(folder / "path", robot, rows, arrays | {"contact": np.array(strike.contact_s)}, note, len(path.t) - 1)
+    _write_rows(folder / "path", robot, path, arrays | {"contact": np.array(strike.contact_s)}, note, len(path.t) - 1)
     if (after := strike.follow_through) is not None and after.rows is not None:
         note = "# The contact is at the first point, whose velocities are those after the predicted impact."
         _write_rows(folder / "follow_through", robot, after.rows, {"contact": np.array(0.0)}, note, 0)
@@ -82,19 +81,19 @@ def read_path(folder: Path, block: Mapping[str, Any], robot: Robot) -> PosturePa
 
     Raise ``ValueError`` if the arrays do not fit each other or the robot.
     """
-    arrays = _read_rows(folder / "path.npz", robot)
+    rows, arrays = _read_rows(folder / "path.npz", robot)
     shares = {key.removeprefix("share_"): array for key, array in arrays.items() if key.startswith("share_")}
     return PosturePath(
+        **vars(rows),
         **{key: block[key] for key in _BLOCK},
-        t=arrays["t"], q=arrays["q"], v=arrays["v"], a=arrays["a"],
         use=LimitUse(**shares, largest=block["limits"]) if shares else None,
         objectives=arrays["objective"],
         strike=_read_strike(folder, block["strike"], robot) if "strike" in block else None,
     )  # fmt: skip
 
 
-def _read_rows(file: Path, robot: Robot) -> dict[str, Array]:
-    """Return the checked arrays of a motion."""
+def _read_rows(file: Path, robot: Robot) -> tuple[RowInterpolation, dict[str, Array]]:
+    """Return a motion and all arrays of its file, which are checked."""
     arrays = {key: np.asarray(array, dtype=float) for key, array in read_arrays(file).items()}
     count, samples = arrays["t"].size, arrays["objective"].size if "objective" in arrays else 0
     wanted = {"t": (count,), "q": (count, robot.nq), "v": (count, robot.nv), "a": (count, robot.nv), "contact": ()}
@@ -105,7 +104,7 @@ def _read_rows(file: Path, robot: Robot) -> dict[str, Array]:
             raise ValueError(f"'{key}' of {file.name} does not fit the path of {robot.name}")
     if count == 0 or (np.diff(arrays["t"]) <= 0).any():
         raise ValueError(f"the times of {file.name} do not increase")
-    return arrays
+    return RowInterpolation(robot.model, *(arrays[key] for key in "tqva")), arrays
 
 
 def _read_strike(folder: Path, block: Mapping[str, Any], robot: Robot) -> Strike:
@@ -116,8 +115,7 @@ def _read_strike(folder: Path, block: Mapping[str, Any], robot: Robot) -> Strike
         raise ValueError(f"the velocity of the strike does not fit {robot.name}")
     rows = None
     if block["follow_through"]["duration_s"] is not None:
-        arrays = _read_rows(folder / "follow_through.npz", robot)
-        rows = RowInterpolation(robot.model, *(arrays[key] for key in "tqva"))
+        rows, _ = _read_rows(folder / "follow_through.npz", robot)
     after |= {key: Room(**after[key]) for key in ("joints", "clearance") if after[key] is not None}
     ends = FollowThrough(**after | {"velocity": velocities[1], "rows": rows})
     return Strike(**{**block, "velocity": velocities[0], "follow_through": ends})

@@ -9,7 +9,6 @@ from importlib.util import find_spec
 import numpy as np
 
 from impact_posture.errors import InputError
-from impact_posture.impact.objective import Objective
 from impact_posture.path.actuator_limits import ActuatorLimits
 from impact_posture.path.follow_through import follow_through
 from impact_posture.path.path_curve import fitted_curve
@@ -17,7 +16,7 @@ from impact_posture.path.path_search import EFFORT, Connection, connect, shorten
 from impact_posture.path.path_space import PathSpace
 from impact_posture.path.path_timing import LimitUse, limit_use, timed
 from impact_posture.path.reachable_curve import ReachableCurve
-from impact_posture.path.row_interpolation import INTERPOLATION
+from impact_posture.path.row_interpolation import INTERPOLATION, RowInterpolation
 from impact_posture.path.strike import RunUp, Strike, check_strike, run_up
 from impact_posture.path.timed_curve import TimedCurve
 from impact_posture.posture.search.multistart import PostureSolution
@@ -34,8 +33,8 @@ _MOST_VISITED = 400
 
 
 @dataclass(frozen=True, eq=False)
-class PosturePath:
-    """A motion from the start to the optimum, or to the best reached posture.
+class PosturePath(RowInterpolation):
+    """A motion from the start to the optimum, or to the best reached posture.  Without motion, it has one row.
 
     Attributes:
         found: Whether the path ends at the optimum.
@@ -44,11 +43,6 @@ class PosturePath:
         method: Method of the search: ``continuation`` or ``sampling``; empty without a motion.
         timing: ``time-optimal``, ``scaled`` or ``slowed``; empty without a motion.
         objective: Objective at the end of the path.
-        t: Times, s, shape (n,); a single zero without a motion.  Between two times, the motion is a
-            :class:`~impact_posture.path.row_interpolation.RowInterpolation`.
-        q: Postures, shape (n, nq).
-        v: Generalized velocities ``ν``, shape (n, nv).
-        a: Generalized accelerations ``ν̇``, shape (n, nv).
         length: Tangent length of the path, rad mixed with m.
         max_violation: Largest violation of a constraint or joint limit at the postures.
         use: Shares of the limits over time; ``None`` without a motion.
@@ -61,10 +55,6 @@ class PosturePath:
     method: str
     timing: str
     objective: float
-    t: Array
-    q: Array
-    v: Array
-    a: Array
     length: float
     max_violation: float
     use: LimitUse | None = None
@@ -77,16 +67,10 @@ class PosturePath:
         return float(self.t[-1])
 
     @property
-    def played(self) -> tuple[Array, Array, Array]:
-        """Times ``t``, postures ``q`` and velocities ``v`` of the path and, after a strike, of the follow-through.
-
-        At the contact, the velocity is that before the impact.
-        """
+    def played(self) -> RowInterpolation:
+        """The path and, after a strike, the follow-through.  The velocity at the contact is before the impact."""
         after = self.strike and self.strike.follow_through and self.strike.follow_through.rows
-        if not after:
-            return self.t, self.q, self.v
-        t = np.append(self.t, self.t[-1] + after.t[1:])
-        return t, np.vstack([self.q, after.q[1:]]), np.vstack([self.v, after.v[1:]])
+        return self.followed_by(after) if after else self
 
     def to_dict(self) -> dict[str, object]:
         """Return JSON content."""
@@ -137,23 +121,23 @@ def posture_path(
         InputError: The package of the extra ``path`` is not installed, or the contact cannot strike.
     """
     check_package()
-    space, start, objective = PathSpace(solution.problem), solution.initial, solution.problem.objective
-    limits, no_strike = ActuatorLimits(objective, start, solution.problem.requirements), ""
+    problem, start, no_strike = solution.problem, solution.initial, ""
+    space, limits = PathSpace(problem), ActuatorLimits(problem.objective, start, problem.requirements)
     if strike is not None:
-        check_strike(solution.problem, strike)
+        check_strike(problem, strike)
         struck = _struck(solution, space, limits, strike, restitution, seed, effort)
         if isinstance(struck, PosturePath):
             return struck
         no_strike = f"the path ends at rest, because {struck}"
     if fault := _fault(space, start):
-        return _still(space, objective, start, fault, no_strike)
+        return _still(space, start, fault, no_strike)
     connection, failure = _reached(solution, space, seed, effort)
     postures = connection.path or [start]
     if len(postures) == 1:
-        return _still(space, objective, start, failure, no_strike)
+        return _still(space, start, failure, no_strike)
     motion = _timed(space, postures, limits, seed)
     if motion is None:
-        return _still(space, objective, start, _NOT_SMOOTH, no_strike)
+        return _still(space, start, _NOT_SMOOTH, no_strike)
     return _finished(space, motion, connection.method, limits, failure, no_strike)
 
 
@@ -181,10 +165,10 @@ def _finished(
     rows, use, objective = motion.rows, limit_use(space, motion, limits), space.problem.objective
     objectives = np.array([objective.value(rows.at(t)[0]) for t in use.at])
     reason = "; ".join(filter(None, [failure, *notes, *motion.notes]))
-    end, length, violation = float(objective.value(rows.q[-1])), space.length(rows.q), max(map(space.worst, rows.q))
     return PosturePath(
-        not failure, reason, method, motion.method, end,
-        rows.t, rows.q, rows.v, rows.a, length, violation, use, objectives, strike,
+        **vars(rows), found=not failure, reason=reason, method=method, timing=motion.method,
+        objective=float(objective.value(rows.q[-1])), length=space.length(rows.q),
+        max_violation=max(map(space.worst, rows.q)), use=use, objectives=objectives, strike=strike,
     )  # fmt: skip
 
 
@@ -219,7 +203,7 @@ def _struck(
             continue
         connection = connect(before, here, begin, seed, effort)
         if connection.path is None:
-            blocked = blocked or "no path to the begin of the run-up was found"
+            blocked = blocked or "no path leads to the begin of the run-up"
             continue
         motion, strike = run.motion, run.strike
         if before.length(connection.path) > _NO_MOTION:
@@ -232,22 +216,23 @@ def _struck(
             strike = replace(strike, run_up_s=shift, contact_s=float(motion.rows.t[-1]))
         after = follow_through(solution.problem, motion.rows.q[-1], strike.velocity, restitution, limits)
         strike = replace(strike, follow_through=after)
-        failure = (
-            f"{first or blocked}; the path ends at optimum number {k + 1} of {len(solution.optima)}" if k else ""
-        )
-        moved = before.distance(start, here)
-        note = f"the path begins {moved:.2g} (rad, m) from the start, so that the contact is above the surface"
-        notes = [note] if moved > _NO_MOTION else []
-        return _finished(before, motion, connection.method, limits, failure, *notes, strike=strike)
+        end = f"the path ends at optimum number {k + 1} of {len(solution.optima)}"
+        failure = f"{first or blocked}; {end}" if k else ""
+        moved, note = before.distance(start, here), ""
+        if moved > _NO_MOTION:
+            note = f"the path begins {moved:.2g} (rad, m) from the start, so that the contact is above the surface"
+        return _finished(before, motion, connection.method, limits, failure, note, strike=strike)
     return blocked or first or "no optimum can be struck"
 
 
-def _still(space: PathSpace, objective: Objective, q: Array, failure: str, *notes: str) -> PosturePath:
-    """Return the path of a robot that stays at its start, which is the optimum if ``failure`` is empty."""
-    rest = np.zeros((1, space.model.nv))
-    value = float(objective.value(q))
-    reason = "; ".join(filter(None, [failure, *notes]))
-    return PosturePath(not failure, reason, "", "", value, np.zeros(1), q[None], rest, rest, 0.0, space.worst(q))
+def _still(space: PathSpace, q: Array, *reasons: str) -> PosturePath:
+    """Return the path of a robot that stays at its start, which is the optimum if the first reason is empty."""
+    rest, value = np.zeros((1, space.model.nv)), float(space.problem.objective.value(q))
+    return PosturePath(
+        space.model, np.zeros(1), q[None], rest, rest, found=not reasons[0],
+        reason="; ".join(filter(None, reasons)), method="", timing="",
+        objective=value, length=0.0, max_violation=space.worst(q),
+    )  # fmt: skip
 
 
 def _targets(solution: PostureSolution, space: PathSpace) -> Iterator[tuple[int, Array]]:
@@ -283,7 +268,7 @@ def _reached(solution: PostureSolution, space: PathSpace, seed: int, effort: int
     lowest = curve.lowest() if curve else min(reached[:: max(1, len(reached) // _MOST_VISITED)], key=objective.value)
     if objective.value(lowest) < best:
         connection, end = connect_to(lowest), "posture that was reached"
-    unproved = "was found at this contact pose, which does not prove that none exists"
+    unproved = "is known at this contact pose, which does not prove that none exists"
     reason = f"no path to the optimum {f'exists at this contact pose ({proof})' if proof else unproved}; "
     if connection.path:
         return connection, f"{reason}the path ends at the best {end}"

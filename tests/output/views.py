@@ -95,8 +95,8 @@ def motion_of(objective: WorstCaseObjective, postures: list[np.ndarray], v: np.n
     use = LimitUse(t, np.full(t.size, 0.4), 0.5 + 0.3 * t, np.full(t.size, np.nan), {"active": None})
     values = np.array([objective.value(q) for q in postures])
     return PosturePath(
-        False, "a reason", "continuation", "scaled", values[-1], t, np.array(postures), np.tile(v, (t.size, 1)),
-        np.zeros((t.size, v.size)), float(np.linalg.norm(v)), 0.0, use, values,
+        objective.robot.model, t, np.array(postures), np.tile(v, (t.size, 1)), np.zeros((t.size, v.size)),
+        False, "a reason", "continuation", "scaled", values[-1], float(np.linalg.norm(v)), 0.0, use, values,
     )  # fmt: skip
 
 

@@ -61,9 +61,8 @@ def moments(request: pytest.FixtureRequest) -> tuple[Robot, PosturePath, list[tu
     solution = solved(request.param)
     path = posture_path(solution, strike=STRIKES.get(request.param))
     assert (path.strike is None) == (request.param not in STRIKES)
-    rows = RowInterpolation(solution.problem.robot.model, path.t, path.q, path.v, path.a)
     t = np.append(np.concatenate([np.linspace(a, b, 10, endpoint=False) for a, b in pairwise(path.t)]), path.t[-1])
-    return solution.problem.robot, path, [(time, *rows.at(time)) for time in t]
+    return solution.problem.robot, path, [(time, *path.at(time)) for time in t]
 
 
 def test_positions_velocities_and_accelerations_agree(

@@ -24,7 +24,6 @@ from impact_posture.path.actuator_limits import ActuatorLimits
 from impact_posture.path.follow_through import after_impact, follow_through
 from impact_posture.path.path_files import read_path, write_path
 from impact_posture.path.posture_path import PosturePath, posture_path
-from impact_posture.path.row_interpolation import RowInterpolation
 from impact_posture.path.strike import StrikeSpaces, check_strike, impact_velocity
 from impact_posture.path.stroke import _SHARE
 from impact_posture.posture.approach.approach_speed import ApproachSpeed
@@ -93,12 +92,11 @@ def test_the_run_up_is_straight_and_clear_and_keeps_feet_and_base(name: str) -> 
     problem, strike = solution.problem, path.strike
     assert strike is not None
     n, model = np.array(problem.objective.contacts[0].normal), problem.robot.model
-    rows = RowInterpolation(model, path.t, path.q, path.v, path.a)
     home = contact_of(problem, path.q[-1])[0]
     times = np.linspace(strike.run_up_s, strike.contact_s, 40)
     heights = []
     for t in times:
-        q, v, _ = rows.at(t)
+        q, v, _ = path.at(t)
         at, J = contact_of(problem, q)
         off = at.translation - home.translation
         heights.append(float(n @ off))
@@ -114,7 +112,7 @@ def test_the_run_up_is_straight_and_clear_and_keeps_feet_and_base(name: str) -> 
             assert not problem.surroundings.collisions(q)
     assert heights[0] == pytest.approx(strike.run_up_m, rel=1e-3) and (np.diff(heights) < 0).all()
     # The robot leaves the begin of the run-up from rest, and the contact never enters the surface before.
-    assert np.abs(rows.at(strike.run_up_s)[1]).max() < 1e-9
+    assert np.abs(path.at(strike.run_up_s)[1]).max() < 1e-9
     assert min(n @ (contact_of(problem, q)[0].translation - home.translation) for q in path.q) > -1e-6
 
 
@@ -309,9 +307,9 @@ def test_files_mark_the_contact(tmp_path: Path) -> None:
     with (tmp_path / "follow_through.csv").open(newline="") as file:
         first = next(csv.DictReader(file))
     assert (first["t"], first["contact"]) == ("0.0", "1")
-    t, q, v = path.played
-    assert t[len(path.t) - 1] == strike.contact_s and (np.diff(t) > 0).all() and len(t) == len(q) == len(v)
-    assert not v[-1].any()
+    played = path.played
+    assert played.t[len(path.t) - 1] == strike.contact_s and (np.diff(played.t) > 0).all()
+    assert len(played.t) == len(played.q) == len(played.v) and not played.v[-1].any()
     block["strike"]["velocity"].pop()
     with pytest.raises(ValueError, match="does not fit solo8"):
         read_path(tmp_path, block, loaded)

@@ -229,7 +229,8 @@ def motion_figure(view: ResultView) -> Figure:
     with framed(*header_lines(view), 6.2, notes) as (figure, body):
         joints, objective, shares = body.subplots(3, 1, sharex=True, height_ratios=[1.4, 1, 1])
         # The integral of the velocity is continuous.  An angle would jump after a full turn.
-        t, q, v = motion.played
+        played = motion.played
+        t, q, v = played.t, played.q, played.v
         steps = np.diff(t)[:, None] * (v[1:] + v[:-1]) / 2
         moved = np.vstack([np.zeros_like(v[:1]), np.cumsum(steps, axis=0)])
         span = np.ptp(moved, axis=0)

@@ -130,10 +130,10 @@ def _frames(view: ResultView) -> tuple[Array, str, Array, Array | None]:
     The fourth value contains the generalized velocities at the frames of a strike, which include the contact.
     """
     if view.motion is not None and len(view.motion.t) > 1:
-        (t, q, v), strike = view.motion.played, view.motion.strike
+        played, strike = view.motion.played, view.motion.strike
         contact = [] if strike is None else [len(view.motion.t) - 1]
-        kept = np.unique([*contact, *np.linspace(0, len(t) - 1, _MOST).astype(int)])
-        return t[kept], "s", q[kept], None if strike is None else v[kept]
+        kept = np.unique([*contact, *np.linspace(0, len(played.t) - 1, _MOST).astype(int)])
+        return played.t[kept], "s", played.q[kept], None if strike is None else played.v[kept]
     if view.path is not None and view.path.s[-1] > 0:
         # Remove repeated points, because the path lengths of frames must increase.
         kept = np.flatnonzero(np.diff(view.path.s, prepend=-1.0) > 0)

@@ -234,10 +234,9 @@ class ControllerFactory:
             return self._stiffened("nominal", "robust", gain)
         if name.endswith(_STIFF):
             return self._stiffened(name.removesuffix(_STIFF), name.removesuffix(_STIFF), gain)
-        if name == "path":
-            return PathDriver(setup, nominal_posture(setup), self.path)
-        if name == "strike" and setup.scenario.contacts is not None:
-            return StrikeDriver(setup, nominal_posture(setup), self.strike)
+        if (path := self.path_of(name)) is not None:
+            follower = PathDriver if path.strike is None else StrikeDriver
+            return follower(setup, nominal_posture(setup), path)
         if name in _OFFLINE:
             return PostureDriver(setup, nominal_posture(setup), self._optimum(name).q)
         if name in _PLAIN:

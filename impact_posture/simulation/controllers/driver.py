@@ -8,7 +8,6 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.path.posture_path import PosturePath
-from impact_posture.path.row_interpolation import RowInterpolation
 from impact_posture.simulation.controllers.compiled_tick import CompiledTick
 from impact_posture.simulation.controllers.contact_reference import ReferencePoint
 from impact_posture.simulation.controllers.task_formulations import build_formulation, end_effector_task
@@ -196,7 +195,6 @@ class PathDriver(Driver):
     def __init__(self, setup: Setup, posture: JointPosture, path: PosturePath) -> None:
         super().__init__(setup, posture)
         self.path = path
-        self._motion = RowInterpolation(setup.robot.model, path.t, path.q, path.v, path.a)
         self._since: float | None = None
         self._body = BodyTaskLead(setup.robot.model)
 
@@ -216,7 +214,7 @@ class PathDriver(Driver):
             if self._since >= path.duration:
                 q, v, a = path.q[-1], np.zeros(model.nv), np.zeros(model.nv)
             else:
-                q, v, a = self._motion.at(self._since)
+                q, v, a = path.at(self._since)
             self.posture.lead(q, v, a)
             self._body.lead(self._body_tasks, q, v, a)
         super().lead(t, reference)

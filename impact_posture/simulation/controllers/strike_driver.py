@@ -37,19 +37,18 @@ class StrikeDriver(ImpactFeedbackDriver):
     def __init__(self, setup: Setup, posture: JointPosture, path: PosturePath) -> None:
         super().__init__(setup, posture)
         assert path.strike is not None  # noqa: S101 (the factory has checked it)
-        self.path, self._strike, model = path, path.strike, setup.robot.model
-        self._motion = RowInterpolation(model, path.t, path.q, path.v, path.a)
-        after = self._strike.follow_through
+        self.path, self._strike, after = path, path.strike, path.strike.follow_through
         self._after = None if after is None else after.rows
-        self._body = BodyTaskLead(model)
+        self._body = BodyTaskLead(setup.robot.model)
         self._begin()
 
     def _begin(self) -> None:
         # Motion to the begin of the run-up, its first and last time in this motion, and the time when it began.
-        self._way, self._until, self._left = self._motion, self._strike.run_up_s, np.inf
+        self._way: RowInterpolation = self.path
+        self._until, self._left = self._strike.run_up_s, np.inf
         # Time of the contact, and the displacement of the robot from its planned posture then.
         self._hit, self._shift = np.inf, np.zeros(self.setup.robot.nv)
-        self._now, self._moment = 0.0, self._motion.at(0.0)
+        self._now, self._moment = 0.0, self.path.at(0.0)
 
     def reset(self, q: Array) -> Command:
         self._begin()
@@ -92,7 +91,7 @@ class StrikeDriver(ImpactFeedbackDriver):
     def _retreat(self) -> None:
         """Begin a motion from the last stop to the begin of the run-up, within :data:`MOVE`."""
         zero = np.zeros((2, self.setup.robot.nv))
-        ends = np.array([self._moment[0], self._motion.at(self._strike.run_up_s)[0]])
+        ends = np.array([self._moment[0], self.path.at(self._strike.run_up_s)[0]])
         self._way = RowInterpolation(self.setup.robot.model, np.array([0.0, MOVE]), ends, zero, zero)
         self._until, self._left, self._hit, self._at = MOVE, self._now, np.inf, np.inf
 
@@ -116,8 +115,8 @@ class StrikeDriver(ImpactFeedbackDriver):
         if self._hit == np.inf:
             late = t - self._at
             if late <= 0:
-                return self._motion.at(self._strike.contact_s + late)
-            q, v, _ = self._motion.at(self._strike.contact_s)
+                return self.path.at(self._strike.contact_s + late)
+            q, v, _ = self.path.at(self._strike.contact_s)
             return np.array(pin.integrate(model, q, late * v)), v, zero
         if self._after is None:
             return np.array(pin.integrate(model, self.path.q[-1], self._shift)), zero, zero
