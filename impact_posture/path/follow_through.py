@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -13,12 +13,15 @@ from impact_posture.dynamics.numeric import Numeric
 from impact_posture.impact.friction.contact_impulses import contact_impulses
 from impact_posture.impact.worst_case.worst_normal import cone_axes
 from impact_posture.path.actuator_limits import ActuatorLimits
+from impact_posture.path.path_curve import PathCurve
 from impact_posture.path.path_space import PathSpace
 from impact_posture.path.row_interpolation import RowInterpolation
 from impact_posture.path.strike_spaces import StrikeSpaces
-from impact_posture.path.stroke import Stroke, shortest_stroke
+from impact_posture.path.stroke import shortest_stroke
+from impact_posture.path.time_law import TimeLaw
 from impact_posture.path.timed_curve import moment, sampled
 from impact_posture.posture.constraints.clearance import Clearance
+from impact_posture.posture.program.certificate import linearized_limits
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem, equality_jacobian
 from impact_posture.system.arrays import Array
 
@@ -84,9 +87,8 @@ def after_impact(
     impact = problem.impact
     oracle = impact.oracle.at(q)
     responses = oracle.solve(oracle.J.T)
-    before = spaces.contact_velocity(Numeric(problem.robot.model).at(q), velocity)
     normals, friction = spaces.normal[None], np.array([impact.contact.friction])
-    p = contact_impulses(oracle.J @ responses, before[None], normals, friction)
+    p = contact_impulses(oracle.J @ responses, (oracle.J @ velocity)[None], normals, friction)
     return None if p is None else velocity + (1 + restitution) * responses @ p[0]
 
 
@@ -110,30 +112,43 @@ def follow_through(
     predicted, rows, stops, hindrance = velocity, None, list[_Stop](), ""
     for k, (name, (at, factor, e)) in enumerate(impacts.items()):
         state = after_impact(problem, at, q, factor * velocity, e)
-        stop = "no impulse is known" if state is None else _stop(at, q, state, limits)
+        stop = "no impulse is known" if state is None else _stop(name, at, q, state, limits)
         predicted = state if k == 0 and state is not None else predicted
         if isinstance(stop, str):
             hindrance = hindrance or f"{stop}, after {name}"
             continue
-        stops.append(_Stop(name, *stop))
-        stroke, duration = stop
-        if k == 0 and stroke.curve is not None:
-            rows = sampled(spaces.rebound, stroke.curve, limits, stroke.law(duration), "").rows
-    near = [room for stop in stops for room in stop.rooms(spaces.rebound)]
+        stops.append(stop)
+        if k == 0:
+            rows = sampled(spaces.rebound, stop.curve, limits, stop.law, "").rows
     return FollowThrough(
-        predicted,
-        rows,
-        len(impacts),
-        len(stops),
-        max((stop.duration for stop in stops), default=0.0),
-        min((room for room in near if room.of.startswith("joint ")), key=lambda room: room.distance, default=None),
-        min((room for room in near if " / " in room.of), key=lambda room: room.distance, default=None),
-        hindrance,
+        velocity=predicted,
+        rows=rows,
+        impacts=len(impacts),
+        stopped=len(stops),
+        longest_s=max((stop.duration for stop in stops), default=0.0),
+        joints=_least(stops, lambda q: _to_limits(spaces.rebound, q)),
+        clearance=_least(stops, lambda q: _to_bodies(spaces.rebound, q)),
+        hindrance=hindrance,
     )
 
 
-def _stop(spaces: StrikeSpaces, q: Array, velocity: Array, limits: ActuatorLimits) -> tuple[Stroke, float] | str:
-    """Return the shortest stop from a velocity, and its duration, s; or why none exists.
+@dataclass(frozen=True, eq=False)
+class _Stop:
+    """A stop after the impact with the name ``impact``; ``duration`` is its shortest duration before rounding, s."""
+
+    impact: str
+    curve: PathCurve
+    law: TimeLaw
+    duration: float
+
+    @property
+    def postures(self) -> Iterator[Array]:
+        times = np.linspace(0.0, self.law.duration, _POSTURES)
+        return (moment(self.curve, self.law, float(t))[0] for t in times)
+
+
+def _stop(impact: str, spaces: StrikeSpaces, q: Array, velocity: Array, limits: ActuatorLimits) -> _Stop | str:
+    """Return the shortest stop from a velocity, or why none exists.
 
     The curve keeps the rebound: the normal velocity of the contact point divided by the length of the curve.
     """
@@ -143,30 +158,28 @@ def _stop(spaces: StrikeSpaces, q: Array, velocity: Array, limits: ActuatorLimit
     stroke, duration = shortest_stroke(space, q, velocity, spaces.rows(space), limits, before=False)
     if stroke.curve is None:
         return f"no stop is possible, because of {stroke.end}"
-    return (
-        f"no stop is possible, because of {stroke.hindrance(limits, 1.0)}" if duration is None else (stroke, duration)
-    )
+    if duration is None:
+        return f"no stop is possible, because of {stroke.hindrance(limits, 1.0)}"
+    return _Stop(impact, stroke.curve, stroke.law(duration), duration)
 
 
-@dataclass(frozen=True, eq=False)
-class _Stop:
-    name: str
-    stroke: Stroke
-    duration: float
+def _least(stops: Sequence[_Stop], distance: Callable[[Array], tuple[float, str]]) -> Room | None:
+    rooms = [Room(*distance(q), stop.impact) for stop in stops for q in stop.postures]
+    least = min(rooms, key=lambda room: room.distance, default=None)
+    return least if least is not None and np.isfinite(least.distance) else None
 
-    def rooms(self, space: PathSpace) -> Iterator[Room]:
-        """Yield the distances from joint limits, and from the nearest bodies, at postures of the stop."""
-        assert self.stroke.curve is not None  # noqa: S101 (narrows a type)
-        chart, problem, law = space.projector.chart, space.problem, self.stroke.law(self.duration)
-        (in_v, in_x), numeric = chart.bounded, space.projector.numeric
-        for t in np.linspace(0.0, law.duration, _POSTURES):
-            q = moment(self.stroke.curve, law, float(t))[0]
-            x, low, high = chart.to_x(q)[in_x], problem.lower[in_x], problem.upper[in_x]
-            distances = np.where(low < high, np.minimum(x - low, high - x), np.inf)
-            if np.isfinite(distances).any():
-                k = int(distances.argmin())
-                yield Room(float(distances[k]), f"joint {problem.robot.tangent_names[in_v[k]]}", self.name)
-            for clearance in problem.constraints:
-                if isinstance(clearance, Clearance):
-                    name, distance = clearance.closest(numeric.at(q))
-                    yield Room(distance, name, self.name)
+
+def _to_limits(space: PathSpace, q: Array) -> tuple[float, str]:
+    """Return the least distance from a joint limit, rad or m, and the joint; infinity without limits."""
+    rows, names = linearized_limits(space.problem, q), space.problem.robot.tangent_names
+    distances = np.minimum(rows.value - rows.lower, rows.upper - rows.value)
+    movable = zip(distances.tolist(), rows.posture.argmax(axis=1).tolist(), rows.lower < rows.upper, strict=True)
+    return min(((d, f"joint {names[k]}") for d, k, moves in movable if moves), default=(np.inf, ""))
+
+
+def _to_bodies(space: PathSpace, q: Array) -> tuple[float, str]:
+    """Return the least distance between bodies minus the clearance, m, and the bodies; infinity without shapes."""
+    numeric = space.projector.numeric.at(q)
+    closest = [c.closest(numeric) for c in space.problem.constraints if isinstance(c, Clearance)]
+    name, distance = min(closest, key=lambda pair: pair[1], default=("", np.inf))
+    return distance, name

@@ -16,8 +16,9 @@ from impact_posture.path.path_space import PathSpace
 from impact_posture.path.strike_spaces import StrikeSpaces
 from impact_posture.path.stroke import shortest_stroke
 from impact_posture.path.timed_curve import TimedCurve, sampled
+from impact_posture.posture.program.certificate import linearized_limits
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem
-from impact_posture.system.arrays import Array
+from impact_posture.system.arrays import Array, null_space
 
 # Weight of the squared velocities, relative to their limits, beside the largest of them.
 _UNIQUE = 1e-4
@@ -74,15 +75,15 @@ def _leaving(space: PathSpace, q: Array) -> Array:
 
     A row is the gradient of an inequality or a joint that is at its bound.
     """
-    model, problem, chart = space.projector.numeric.at(q), space.problem, space.projector.chart
-    in_v, in_x = (np.array(entries, dtype=int) for entries in chart.bounded)
-    x = chart.to_x(q)[in_x]
-    bounded = [(x, np.eye(problem.robot.nv)[in_v], problem.lower[in_x], problem.upper[in_x])]
+    model, problem = space.projector.numeric.at(q), space.problem
+    limits = linearized_limits(problem, q)
+    bounded = [(limits.value, limits.posture, limits.lower, limits.upper)]
     bounded += [(*c.evaluate(model), c.lower, c.upper) for c in problem.constraints if not c.equality]
-    rows = [np.zeros((0, problem.robot.nv))]
-    for value, jacobian, lower, upper in bounded:
-        rows += [jacobian[value > upper - _ACTIVE], -jacobian[value < lower + _ACTIVE]]
-    return np.vstack(rows)
+    return np.vstack([
+        rows
+        for value, jacobian, lower, upper in bounded
+        for rows in (jacobian[value > upper - _ACTIVE], -jacobian[value < lower + _ACTIVE])
+    ])  # fmt: skip
 
 
 def impact_velocity(spaces: StrikeSpaces, q: Array, speed: float) -> tuple[Array, float] | None:
@@ -100,8 +101,7 @@ def impact_velocity(spaces: StrikeSpaces, q: Array, speed: float) -> tuple[Array
     least = np.linalg.pinv(A, rcond=1e-9) @ b
     if np.abs(A @ least - b).max() > _MISSED * speed:
         return None
-    _, values, vectors = np.linalg.svd(A)
-    N = vectors[(values > 1e-9 * values.max()).sum() :].T
+    N = null_space(A, 1e-9)
     # The unknowns are z and s: ν/ν̄ = least + N z, and its entries with a limit are at most s in size.
     of, one, count = N[limited], np.ones((int(limited.sum()), 1)), N.shape[1]
     leaving = _leaving(spaces.run_up, q) * scale
@@ -168,8 +168,9 @@ def run_up(problem: ConstrainedProblem, q: Array, speed: float, limits: Actuator
         return f"no speed is possible, because of {hindrance}"
     notes = (f"{limits.missing}: the run-up is timed by velocities alone",) if limits.missing else ()
     motion = sampled(space, stroke.curve, limits, stroke.law(duration, low), "scaled", notes)
-    end, distance = float(motion.rows.t[-1]), low * speed * float(motion.rows.t[-1]) / 2
+    reached, end = low * speed, float(motion.rows.t[-1])
     strike = Strike(
-        low * speed, speed, 0.0, distance, end, motion.rows.v[-1], low * share, hindrance if low < 1 else ""
-    )
+        speed=reached, stated_speed=speed, run_up_s=0.0, run_up_m=reached * end / 2, contact_s=end,
+        velocity=motion.rows.v[-1], share=low * share, hindrance=hindrance,
+    )  # fmt: skip
     return RunUp(motion, strike, spaces)

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 
 from impact_posture.dynamics.numeric import Numeric
-from impact_posture.impact.impact_contact import point_on
 from impact_posture.impact.worst_case.worst_normal import cone_axes
 from impact_posture.path.path_space import PathSpace
 from impact_posture.posture.constraints.center_of_mass_over_feet import CenterOfMassOverFeet
@@ -52,11 +51,8 @@ class StrikeSpaces:
     def __init__(
         self, problem: ConstrainedProblem, q: Array, *, turns: bool = False, normal: Array | None = None
     ) -> None:
-        (contact,), numeric = problem.objective.contacts, Numeric(problem.robot.model).at(q)
-        self._point = point_on(problem.robot, contact.frame, contact.offset)
-        at, n = numeric.placement(self._point), np.array(contact.normal)
-        self.normal = np.asarray(at.rotation @ n) if contact.normal_frame == "contact" else n
-        self.normal = self.normal if normal is None else normal
+        oracle = problem.impact.oracle.at(q)
+        self._point, self.normal = oracle.point, oracle.n if normal is None else normal
         tangents = cone_axes(self.normal)[:, 1:].T
         first = len(problem.objective.supports)
         # The constraint on the position comes first.  A constraint on the tilt may follow.
@@ -71,7 +67,7 @@ class StrikeSpaces:
             for k, c in enumerate(problem.constraints)
             if not (first <= k < first + count or c.at_impact)
         ]
-        contact_at = self._point, at.translation
+        contact_at = self._point, oracle.numeric.placement(self._point).translation
         above = PositionAlong("contact above the surface", *contact_at, self.normal[None], 0.0, np.inf)
         line = PositionAlong("contact on the normal", *contact_at, tangents, 0.0, 0.0)
         dropped = (*_POSES, *_AT_REST) if first else (*_POSES, *_AT_REST, HeldTurn)
@@ -88,10 +84,6 @@ class StrikeSpaces:
                 (wide, [*struck, pressed]),
             )
         )
-
-    def contact_velocity(self, model: Numeric, velocity: Array) -> Array:
-        """Return the velocity of the contact point, world axes, shape (3,)."""
-        return np.asarray(model.jacobian(self._point)[:3] @ velocity)
 
     def rows(self, space: PathSpace) -> Callable[[Numeric], Array]:
         """Return a function for the matrix ``(J_equalities; nᵀJ)`` of a space, shape (m, nv)."""

@@ -109,7 +109,7 @@ def certify(
         auxiliaries = problem.guess(numeric).values
     parts = [c.linearize(numeric, z) for c, z in zip(problem.constraints, problem.split(auxiliaries), strict=True)]
     errors = [c.pose_error(part.value) for c, part in zip(problem.constraints, parts, strict=True)]
-    rows, limits = Linearization.joined(parts, problem.robot.nv), _limits(problem, q)
+    rows, limits = Linearization.joined(parts, problem.robot.nv), linearized_limits(problem, q)
     near: list[_NearBound] = []
     # For a posture that violates the constraints, multipliers would take long to compute and could not certify it.
     if rows.violation <= _HOPELESS:
@@ -180,8 +180,8 @@ def _active(near: Sequence[_NearBound], multipliers: Array) -> tuple[Active, ...
     return tuple(Active(*key, multiplier) for key, multiplier in sums.items())
 
 
-def _limits(problem: ConstrainedProblem, q: Array) -> Linearization:
-    """Return the linearized rows of the joint limits."""
+def linearized_limits(problem: ConstrainedProblem, q: Array) -> Linearization:
+    """Return the rows of the joint limits at ``q``, shape (nq,)."""
     chart = Chart.of(problem.robot.model)
     in_v, in_x = chart.bounded
     names = [next(f"joint '{s.name}'" for s in chart.slots if s.v.start <= k < s.v.stop) for k in in_v]
