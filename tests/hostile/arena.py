@@ -41,6 +41,18 @@ SMALL = """<robot name="small">
   <joint name="wrist" type="fixed"><parent link="lower"/><child link="tip"/><origin xyz="0 0 0.3"/></joint>
 </robot>
 """
+PUSH = ("small.urdf", "--frame", "tip", "--normal", "1", "0", "0")
+# A sweep of two points.
+SWEEP = """
+[problem]
+robot = "small.urdf"
+frame = "tip"
+normal = [1, 0, 0]
+contact_pose = "free"
+starts = 1
+[grid]
+speed = [1, 2]
+"""
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from tests.experiment.conftest import shortened
-from tests.hostile.arena import Outcome, judging, strike
+from tests.hostile.arena import SWEEP, Outcome, judging, strike
 
 COMMAND = str(Path(sys.executable).parent / "impact-posture")
 FAKETIME = next((str(path) for path in Path("/usr/lib").glob("*/faketime/libfaketime.so.1")), "")
@@ -41,15 +41,6 @@ CLOCKS = (
     "@2038-01-19 03:14:06",
     "@2108-01-01 00:00:00",
 )
-SWEEP = """[problem]
-robot = "small.urdf"
-frame = "tip"
-normal = [1, 0, 0.3]
-contact_pose = "box"
-starts = 1
-[grid]
-x = [0.0, 0.02]
-"""
 
 
 def prepare(folder: Path) -> None:

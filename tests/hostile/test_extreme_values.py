@@ -11,41 +11,10 @@ import pytest
 from impact_posture.output import plot
 from tests.hostile import arena as attacker
 from tests.hostile.arena import SMALL, Outcome, strike
+from tests.simulation.factories import HIT
 from tests.support.urdfs import joint, link, write
 
 PUSH = ("--frame", "tip", "--normal", "1", "0", "0")
-SCENARIO = """schema = "impact-posture/scenario/1"
-name = "slide"
-description = "a slider touches a wall"
-robot = "written.urdf"
-posture = "neutral"
-[physics]
-timestep = 0.001
-[[surfaces]]
-name = "wall"
-normal = [-1, 0, 0]
-gap = 0.1
-solref = [0.004, 1.0]
-[[shapes]]
-frame = "tip"
-size = [0.01]
-[contacts]
-frame = "tip"
-surface = "wall"
-speed = 0.5
-acceleration = 2.0
-count = 1
-settle = 0.1
-dwell = 0.05
-pause = 0.1
-window = 0.05
-[control.end_effector]
-kp = 100.0
-[control.posture]
-kp = 10.0
-[control.robust]
-gain = 10.0
-"""
 
 
 def clean(outcome: Outcome, code: int, *words: str) -> None:
@@ -62,7 +31,8 @@ def test_one_sliding_joint(arena: Path, monkeypatch: pytest.MonkeyPatch) -> None
     box = "0.1 0.1 0.1"
     slide = joint("slide", "base tip", "1 0 0", kind="prismatic")
     write(arena, link("base", at="0.5 0 0", box=box), link("tip", 1, "0 0 0.3", box=box), slide)
-    (arena / "slide.toml").write_text(SCENARIO)
+    text = HIT.format(robot="written.urdf", frame="tip", more='posture = "neutral"')
+    (arena / "slide.toml").write_text(text.replace("[0, 0, 1]", "[-1, 0, 0]"))
     (arena / "sweep.toml").write_text(
         '[problem]\nrobot = "written.urdf"\nframe = "tip"\nnormal = [1, 0, 0]\nstarts = 1\n[grid]\nspeed = [1, 2]\n'
     )

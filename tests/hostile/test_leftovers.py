@@ -13,21 +13,8 @@ import pytest
 from impact_posture.errors import OutputError
 from impact_posture.system.libraries import cache_path
 from impact_posture.system.scratch_folder import scratch_folder
-from tests.hostile.arena import SMALL
+from tests.hostile.arena import PUSH, SMALL, SWEEP
 from tests.support.command import refused, run
-
-PUSH = ("small.urdf", "--frame", "tip", "--normal", "1", "0", "0")
-SWEEP = """
-[problem]
-robot = "small.urdf"
-frame = "tip"
-normal = [1, 0, 0]
-contact_pose = "free"
-starts = 1
-{}
-[grid]
-speed = [1, 2]
-"""
 
 
 def names(folder: Path) -> list[str]:
@@ -44,7 +31,7 @@ def files_of(size: int) -> Callable[[], None]:
 
 def test_a_sweep_on_a_full_disk_leaves_nothing(arena: Path) -> None:
     pytest.importorskip("pyarrow")
-    (arena / "sweep.toml").write_text(SWEEP.format(""))
+    (arena / "sweep.toml").write_text(SWEEP)
     before = names(arena)
     refused(run("sweep", "sweep.toml", "--out", "press", cwd=arena, prepare=files_of(600)), 1, "press", "too large")
     assert names(arena) == before
@@ -107,7 +94,7 @@ def odd(tmp_path: Path, sound: None) -> Path:
     except OSError:
         pytest.skip("this file system has only names in UTF-8")
     (folder / "small.urdf").write_text(SMALL)
-    (folder / "sweep.toml").write_text(SWEEP.format(""))
+    (folder / "sweep.toml").write_text(SWEEP)
     return folder
 
 
@@ -160,7 +147,7 @@ def test_a_cache_that_is_not_utf8_is_named(variable: str, tmp_path: Path, monkey
 )
 def test_errors_of_a_sweep_file_name_keys_and_no_options(key: str, words: str, arena: Path) -> None:
     pytest.importorskip("pyarrow")
-    (arena / "sweep.toml").write_text(SWEEP.format(key))
+    (arena / "sweep.toml").write_text(SWEEP.replace("[grid]", f"{key}\n[grid]"))
     refused(run("sweep", "sweep.toml", cwd=arena), 1, words)
 
 

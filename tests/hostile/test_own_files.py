@@ -16,26 +16,15 @@ from impact_posture.sweep.sweep_run import run_sweep
 from impact_posture.system.output_folder import added_files, check_output, whole_folder
 from impact_posture.system.scratch_folder import RECORD
 from impact_posture_cli.app import build
-from tests.hostile.arena import SMALL, judging, strike
+from tests.hostile.arena import PUSH, SMALL, SWEEP, judging, strike
 from tests.hostile.values import spoiled
 
-SWEEP = """
-[problem]
-robot = "small.urdf"
-frame = "tip"
-normal = [1, 0, 0]
-contact_pose = "free"
-starts = 1
-[grid]
-speed = [1, 2]
-"""
 # A command, and a file that the command adds to an existing folder.
 ADDING = {
     "plot": (("plot", "out", "--figure", "jump", "--format", "svg", "--out", "."), "jump.svg"),
     "report": (("report", "out"), "out/report.html"),
     "sweep show": (("sweep", "show", "press", "--format", "svg"), "press/maps/map-0.svg"),
 }
-PUSH = ("small.urdf", "--frame", "tip", "--normal", "1", "0", "0")
 # Commands that write the folder ``precious``, or a file.
 WHOLE = {
     "optimize": ("optimize", *PUSH, "--out", "precious"),

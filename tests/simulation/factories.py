@@ -21,6 +21,42 @@ from impact_posture.simulation.setup import Setup, set_up
 AERIAL = ("aerial-vertical", "aerial-lateral")
 PUSHES = ("solo8-push", "talos-push")
 SHIPPED = (*AERIAL, *PUSHES)
+# A contact with a table, from a posture that ``more`` may give.
+HIT = """
+name = "mine"
+robot = "{robot}"
+{more}
+
+[physics]
+timestep = 0.0005
+
+[[surfaces]]
+name = "table"
+normal = [0, 0, 1]
+gap = 0.04
+
+[[shapes]]
+frame = "{frame}"
+size = [0.01]
+
+[contacts]
+frame = "{frame}"
+surface = "table"
+speed = 0.2
+count = 1
+settle = 0.2
+dwell = 0.1
+pause = 0.05
+
+[control.end_effector]
+kp = 100
+
+[control.posture]
+kp = 10
+
+[control.robust]
+gain = 20
+"""
 
 
 def needs_mujoco() -> None:

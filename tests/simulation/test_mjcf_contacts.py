@@ -25,8 +25,7 @@ from impact_posture.simulation.world.scene import Physics, Scene, Shape, Surface
 from impact_posture.simulation.world.world import build_world
 from impact_posture.simulation.world.world_builder import build_scene
 from tests.dynamics.test_mjcf import qacc
-from tests.simulation.factories import controller_factory, driven
-from tests.simulation.test_user_robots import HIT
+from tests.simulation.factories import HIT, controller_factory, driven
 from tests.support.helpers import assert_close, mass_matrix, rng
 from tests.support.mjcfs import ARM, MESH, ODD, QUADRUPED
 

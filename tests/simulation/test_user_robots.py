@@ -21,46 +21,10 @@ from impact_posture.simulation.prediction import predict
 from impact_posture.simulation.run import run
 from impact_posture.simulation.scenario_file import read_scenario
 from impact_posture.simulation.setup import set_up
-from tests.simulation.factories import controller_factory, driven, fields_of
+from tests.simulation.factories import HIT, controller_factory, driven, fields_of
 from tests.support.helpers import robot as known_robot
 
 RAIL = Path(__file__).parents[2] / "docs" / "examples" / "rail_arm"
-
-HIT = """
-name = "mine"
-robot = "{robot}"
-{more}
-
-[physics]
-timestep = 0.0005
-
-[[surfaces]]
-name = "table"
-normal = [0, 0, 1]
-gap = 0.04
-
-[[shapes]]
-frame = "{frame}"
-size = [0.01]
-
-[contacts]
-frame = "{frame}"
-surface = "table"
-speed = 0.2
-count = 1
-settle = 0.2
-dwell = 0.1
-pause = 0.05
-
-[control.end_effector]
-kp = 100
-
-[control.posture]
-kp = 10
-
-[control.robust]
-gain = 20
-"""
 
 PUSH = """
 name = "mine"
