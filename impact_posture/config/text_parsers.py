@@ -41,7 +41,7 @@ def parse_armature(texts: Sequence[str]) -> Mapping[str, float] | str | None:
     """
     if not texts:
         return None
-    if len(texts) == 1 and ("=" not in texts[0] or os.path.isfile(texts[0])):
+    if len(texts) == 1 and (os.path.isfile(texts[0]) or not ("=" in texts[0] or finite_numbers(texts[0]))):
         return texts[0]
     values = []
     for text in texts:
@@ -51,9 +51,8 @@ def parse_armature(texts: Sequence[str]) -> Mapping[str, float] | str | None:
                 raise ValueError
             values.append((joint, float(value)))
         except ValueError:
-            raise InputError(
-                f"'{text}' is not JOINT=VALUE", where="armature", hint="give none, one file, or only JOINT=VALUE"
-            ) from None
+            hint = "give none, one file, or only JOINT=VALUE; for all joints, set [armature] default in robot.toml"
+            raise InputError(f"'{text}' is not JOINT=VALUE", where="armature", hint=hint) from None
     return _each_once(values, "armature")
 
 

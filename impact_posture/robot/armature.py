@@ -81,6 +81,9 @@ def _set_joints(
     model: pin.Model, armature: Array, values: Mapping[str, float], where: str, error: type[InputError] = SpecError
 ) -> None:
     for joint, value in values.items():
+        if joint == "default" and not model.existJointName(joint):
+            hint = "give JOINT=VALUE; for all joints, set [armature] default in robot.toml"
+            raise error("'default' is not a joint", where=where, hint=hint)
         index = joint_index(model, joint, where)
         if not (np.isfinite(value) and value >= 0):
             raise error(f"armature of '{joint}' is {value:g}", where=where, hint="give a number ≥ 0")

@@ -277,6 +277,7 @@ ERRORS = [
     ((*PUSH, "--frame", "upperarm"), "FrameNotFound", "upper_arm"),
     ((*INSPECT, "--lock", "elbow"), "JointNotFound", "did you mean elbow_pitch"),
     ((*INSPECT, "--armature", "shoulder_rol=1"), "JointNotFound", "did you mean shoulder_roll"),
+    ((*INSPECT, "--armature", "default=0.05"), "InputError", "for all joints, set [armature] default in robot.toml"),
     ((*PUSH, "--posture", "hom"), "PostureNotFound", "did you mean home"),
     ((*PUSH, "--posture", "nowhere.json"), "PostureError", "nowhere.json: no such file"),
     ((*PUSH, "--support", "tipp"), "FrameNotFound", "did you mean tip"),

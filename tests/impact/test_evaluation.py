@@ -278,7 +278,7 @@ def test_armature_as_text() -> None:
     assert parse_armature(["none"]) == "none"
     assert parse_armature(["motors.toml"]) == "motors.toml"
     assert parse_armature(["a=0.1", "b=2e-3"]) == {"a": 0.1, "b": 2e-3}
-    for texts in (["a=0.1", "motors.toml"], ["a=much"], ["none", "a=1"]):
+    for texts in (["a=0.1", "motors.toml"], ["a=much"], ["none", "a=1"], ["0.05"]):
         with pytest.raises(InputError, match=r"^armature: "):
             parse_armature(texts)
 
