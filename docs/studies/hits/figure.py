@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from docs.studies.core import ROOT, Vector
@@ -33,7 +32,6 @@ def course(hit: Hit, arm: Arm) -> tuple[Vector, Vector]:
 def figure(groups: Mapping[Group, Sequence[Hit]], best: Evaluation) -> Figure:
     """Draw one column for each group and one row for each shown joint."""
     drawing = Figure(figsize=(WIDTH, 5.6), layout="constrained")
-    FigureCanvasAgg(drawing)
     panels = drawing.subplots(len(JOINTS_SHOWN), len(groups), sharex=True, sharey="row", squeeze=False)
     for column, (group, hits) in enumerate(groups.items()):
         jumps = best.jumps(group)

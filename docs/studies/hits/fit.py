@@ -57,11 +57,6 @@ def summary(hits: Sequence[Hit], arm: Arm) -> Summary:
     return Summary(hits[0].group, *np.median(values, axis=0))
 
 
-def as_recorded(measured: Summary) -> Summary:
-    """Return the summary with the jumps as recorded, with the effects of trend and controller."""
-    return replace(measured, jump=measured.recorded)
-
-
 def fit_last_link(hits: Sequence[Hit]) -> tuple[float, float]:
     """Return the mass (kg) that link 7 must gain, and its moment along the axis (kg·m).
 
@@ -174,7 +169,7 @@ class Fit:
     def summary(self, hits: Sequence[Hit]) -> Summary:
         """Return the medians of any group."""
         measured = summary(hits, self.arm)
-        return as_recorded(measured) if self.recorded else measured
+        return replace(measured, jump=measured.recorded) if self.recorded else measured
 
     @cached_property
     def models(self) -> dict[str, Fitted]:

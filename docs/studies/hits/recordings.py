@@ -21,12 +21,12 @@ SOURCE = (
     "recordings: epfl-lasa/air_hockey on GitHub, folder data/airhockey_consistency_with_NS_inertia_shaping "
     "(files IIWA_7_hit_*.csv); then `make study-hits DATA=FOLDER`"
 )
-# Name of a quantity here → column of a CSV file, key of a window, number of entries.
+# Name of a quantity here → column of a CSV file, key of a window.
 _QUANTITIES = {
-    "q": ("JointPosition", "q", JOINTS),
-    "dq": ("JointVelocity", "dq", JOINTS),
-    "effort": ("JointEffort", "tau", JOINTS),
-    "command": ("TorqueCmd", "tau_cmd", JOINTS),
+    "q": ("JointPosition", "q"),
+    "dq": ("JointVelocity", "dq"),
+    "effort": ("JointEffort", "tau"),
+    "command": ("TorqueCmd", "tau_cmd"),
 }
 # Rows that are kept before and after the contact of a CSV file.
 _BEFORE, _AFTER = 7, 14
@@ -139,14 +139,8 @@ def read_hits(folder: Path) -> tuple[list[Hit], list[str]]:
     files = sorted([*folder.rglob("IIWA_7_hit_*.csv"), *folder.rglob("*hit_*.json")])
     if not files:
         raise InputError("contains no recording of a hit", where=str(folder), hint=SOURCE)
-    hits, left_out = list[Hit](), list[str]()
-    for path in files:
-        hit = _read(path)
-        if isinstance(hit, Hit):
-            hits.append(hit)
-        else:
-            left_out.append(f"{path.stem} ({hit})")
-    return hits, left_out
+    results = [_read(path) for path in files]
+    return [hit for hit in results if isinstance(hit, Hit)], [reason for reason in results if isinstance(reason, str)]
 
 
 def _read(path: Path) -> Hit | str:
@@ -181,7 +175,7 @@ def _from_window(path: Path) -> tuple[str, int | None, Vector, dict[str, Vector]
     window = json.loads(path.read_text(encoding="utf-8"))
     contact = window["contact_row_approx"] if "contact_row_approx" in window else window["impact_row"]
     contact = None if contact is None else int(contact)
-    rows = _arrays({name: [row[key] for row in window["rows"]] for name, (_, key, _) in _QUANTITIES.items()})
+    rows = _arrays({name: [row[key] for row in window["rows"]] for name, (_, key) in _QUANTITIES.items()})
     return str(window["source"]), contact, _times([row["t"] for row in window["rows"]]), rows
 
 
@@ -190,7 +184,7 @@ def _from_csv(path: Path) -> tuple[str, int | None, Vector, dict[str, Vector]]:
         table = csv.reader(lines)
         names = next(row for row in table if row and row[0] == "RobotName")
         rows = [dict(zip(names, row, strict=True)) for row in table]
-    arrays = _arrays({name: [row[column].split() for row in rows] for name, (column, _, _) in _QUANTITIES.items()})
+    arrays = _arrays({name: [row[column].split() for row in rows] for name, (column, _) in _QUANTITIES.items()})
     times = _times([row["RosTime"] for row in rows])
     contact = contact_row(arrays["effort"], arrays["command"])
     if contact is None:
@@ -203,8 +197,8 @@ def _from_csv(path: Path) -> tuple[str, int | None, Vector, dict[str, Vector]]:
 def _arrays(lists: Mapping[str, Iterable[Any]]) -> dict[str, Vector]:
     arrays = {name: np.array(list(values), dtype=float) for name, values in lists.items()}
     for name, array in arrays.items():
-        if array.ndim != 2 or array.shape[1] != _QUANTITIES[name][2] or not np.isfinite(array).all():
-            raise ValueError(f"{name} must have {_QUANTITIES[name][2]} finite numbers in each row")
+        if array.ndim != 2 or array.shape[1] != JOINTS or not np.isfinite(array).all():
+            raise ValueError(f"{name} must have {JOINTS} finite numbers in each row")
     return arrays
 
 

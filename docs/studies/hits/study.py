@@ -181,8 +181,7 @@ def _recordings(groups: Groups, left_out: Sequence[str], request: Request) -> It
     yield f"Hits: {used}. Intervals contain 95 % of {request.count} bootstrap resamples (seed {request.seed}) of the"
     yield "hits, with a new fit for each resample."
     if left_out:
-        reasons = sorted({text.partition("(")[2].rstrip(")") for text in left_out})
-        counts = [f"{sum(f'({reason})' in text for text in left_out)} ({reason})" for reason in reasons]
+        counts = [f"{left_out.count(reason)} ({reason})" for reason in sorted(set(left_out))]
         yield f"Left out: {', '.join(counts)}."
     yield ""
 
