@@ -6,18 +6,18 @@ import os
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from functools import lru_cache
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from impact_posture.config.checked import checked
-from impact_posture.errors import InputError, OutputError, SpecError, listed
+from impact_posture.errors import OutputError, SpecError, listed
 from impact_posture.posture.formulation.problem_file import dump_settings
 from impact_posture.sweep.case_solver import CaseSolver
 from impact_posture.sweep.shard_table import passes_of, read_postures, shard_name
 from impact_posture.sweep.sweep_file import Sweep
 from impact_posture.sweep.sweep_manifest import MANIFEST, check_key, manifest_text, read_manifest
 from impact_posture.system.libraries import source_key
+from impact_posture.system.optional_package import import_extra
 from impact_posture.system.output_folder import used_alone, whole_folder, write_whole
 from impact_posture.system.text_files import open_regular, read_bytes
 
@@ -175,7 +175,7 @@ def open_atlas(folder: str | Path) -> Dataset:
         InputError: pyarrow is not installed.
         SpecError: The folder is not a sweep folder, has no finished shard, or is damaged.
     """
-    check_package("pyarrow", "sweep")
+    import_extra("pyarrow", "sweep")
     from pyarrow import dataset, fs
 
     manifest, data = read_manifest(Path(folder)), Path(folder) / _DATA
@@ -206,10 +206,3 @@ def reading(folder: Path) -> Iterator[None]:
         yield
     except (OSError, ArrowException) as error:
         raise SpecError(f"cannot be read ({error})", where=str(folder), hint="run sweep again") from None
-
-
-def check_package(name: str, extra: str) -> None:
-    """Raise an InputError if a package is not installed.  The hint names the ``extra`` that installs the package."""
-    if find_spec(name) is None:
-        what = f"needs the package {name}"
-        raise InputError(what, where="sweep", hint=f"pip install 'impact-posture[{extra}]'")

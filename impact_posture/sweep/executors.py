@@ -12,7 +12,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from impact_posture.errors import InputError
-from impact_posture.sweep.atlas import check_package
+from impact_posture.system.optional_package import import_extra
 
 
 @contextmanager
@@ -22,7 +22,7 @@ def dask_cluster(address: str) -> Iterator[Executor]:
     Raises:
         InputError: The package ``distributed`` is not installed, or no scheduler answers at the address.
     """
-    check_package("distributed", "dask")
+    import_extra("distributed", "dask")
     from distributed import Client
 
     try:
@@ -57,7 +57,7 @@ def mpi_ranks() -> Iterator[Executor]:
     Raises:
         InputError: The package ``mpi4py`` or an MPI library is not installed.
     """
-    check_package("mpi4py", "mpi")
+    import_extra("mpi4py", "mpi")
     try:
         from mpi4py.futures import MPIPoolExecutor
     except (ImportError, RuntimeError) as error:
@@ -77,7 +77,7 @@ class SlurmJobs(Executor):
     """
 
     def __init__(self, folder: Path, options: dict[str, Any], cluster: str | None = None) -> None:
-        check_package("submitit", "slurm")
+        import_extra("submitit", "slurm")
         self._folder, self._options, self._cluster = folder, options, cluster
         # submitit creates the folder together with the executor.  Check the options in a temporary folder, so that
         # invalid options leave no folder.

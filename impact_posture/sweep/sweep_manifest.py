@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from impact_posture.config.demand import Demand
+from impact_posture.config.demand import Demand, Finite, OneOrMore
 from impact_posture.config.table_validation import StrictTable, validate
 from impact_posture.errors import OutputError, SpecError
 from impact_posture.posture.formulation.problem_file import dump_settings
@@ -21,9 +20,7 @@ MANIFEST = "manifest.json"
 # Folders of schema 1 contain no checksums.
 _UNSEALED, _SCHEMA = "impact-posture/sweep-folder/1", "impact-posture/sweep-folder/2"
 
-_Number = Annotated[float, Demand(isfinite, "a finite number")]
-_Values = tuple[_Number, ...] | tuple[tuple[_Number, ...], ...]
-_Count = Annotated[int, Demand(lambda count: count > 0, "a whole number above zero")]
+_Values = tuple[Finite, ...] | tuple[tuple[Finite, ...], ...]
 
 
 def _alike(values: Any) -> bool:
@@ -66,9 +63,9 @@ class SweepManifest(StrictTable):
     schema: Literal["impact-posture/sweep-folder/1", "impact-posture/sweep-folder/2"]
     version: str
     key: str
-    points: _Count
-    shards: _Count
-    shard: _Count
+    points: OneOrMore
+    shards: OneOrMore
+    shard: OneOrMore
     cases: tuple[ManifestCase, ...]
     axes: tuple[ManifestAxis, ...]
     checksum: str = ""
@@ -137,12 +134,11 @@ def check_key(folder: Path, key: str) -> None:
 
 
 def _read(folder: Path) -> tuple[str, Any]:
+    hint = "name a folder that sweep wrote"
     try:
         text = read_text(folder / MANIFEST)
         return text, json.loads(text)
     except FileNotFoundError:
-        hint = "name a folder that sweep wrote"
         raise SpecError(f"contains no {MANIFEST}", where=str(folder), hint=hint) from None
     except (OSError, ValueError, RecursionError) as error:
-        hint = "name a folder that sweep wrote"
         raise SpecError.unreadable(folder / MANIFEST, error, hint) from None

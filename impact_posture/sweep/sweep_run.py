@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from impact_posture.errors import WorkerDied
-from impact_posture.sweep.atlas import Atlas, check_package, sweep_key
+from impact_posture.sweep.atlas import Atlas, sweep_key
 from impact_posture.sweep.shard import ShardResult, revise_shard, solve_shard
 from impact_posture.sweep.shard_table import STATUS
 from impact_posture.sweep.sweep_file import Sweep
+from impact_posture.system.optional_package import import_extra
 
 Progress = Callable[[int, int], None]
 # Maximum number of shards that are submitted and not yet written.  A larger number needs more memory.  With a smaller
@@ -75,7 +76,7 @@ def run_sweep(
         WorkerDied: A worker process was killed, or the executor lost its workers.  Run the sweep again to continue
             it.
     """
-    check_package("pyarrow", "sweep")
+    import_extra("pyarrow", "sweep")
     key = sweep_key(sweep)
     atlas = Atlas(folder, sweep, key)
     counts, shards, solver_s, total_s = dict.fromkeys(STATUS, 0), 0, 0.0, 0.0
