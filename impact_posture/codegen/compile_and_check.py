@@ -60,7 +60,7 @@ def compile_and_check(
     if its results are wrong.
 
     Raises:
-        CompilerError: There is no compiler, the compiler failed, or the results of the compiled code are wrong.
+        CompilerError: No compiler is installed, the compiler failed, or the results of the compiled code are wrong.
     """
     manifest, _ = read_manifest(export_dir / f"{prefix}.json")
     real, worst = REALS[manifest["real"]], 0.0

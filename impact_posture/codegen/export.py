@@ -91,7 +91,7 @@ class Export(WrittenCode):
         if self.library is not None:
             return f"{self.library.name}: built, agrees to {self.agreement:.0e}"
         if self.requested:
-            return f"not built, there is no C compiler: {GET_ONE}, then make shared in {self.out}"
+            return f"not built, because no C compiler is installed: {GET_ONE}, then make shared in {self.out}"
         return f"build and self-test: make -C {self.out} check (or codegen --compile)"
 
     def to_dict(self) -> dict[str, Any]:

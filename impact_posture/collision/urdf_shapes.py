@@ -192,7 +192,7 @@ def _read(tag: ET.Element, name: str, link: str, files: RobotFiles, colors: Mapp
 
 
 def _color(material: ET.Element | None, named: Mapping[str, ET.Element]) -> tuple[float, ...] | None:
-    """Return the color in a material tag, or else in the named material; ``None`` if there is no valid color."""
+    """Return the color in a material tag, or else in the named material; ``None`` without a valid color."""
     for tag in () if material is None else (material, named.get(material.get("name", ""))):
         color = None if tag is None else tag.find("color")
         if color is not None:

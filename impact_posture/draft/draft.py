@@ -115,13 +115,13 @@ def draft_spec(located: Located, options: LoadOptions, folder: Path) -> Draft:
         draft.key("default_posture", default, chosen, guessed=True)
     draft.lines += ["", "[model]"]
     if srdf is not None and (options.srdf or located.files.srdf is None):
-        draft.key("srdf", _path(srdf, folder), "as --srdf says" if options.srdf else "found near the URDF")
+        draft.key("srdf", _path(srdf, folder), "as --srdf says" if options.srdf else "lies near the URDF")
     draft.key("root", root, why, guessed=options.root is None and robot.mjcf is None)
     _model(draft, robot, options, folder)
     if default == "neutral" and robot.joint_names:
         base = ("base = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]",) if robot.floating else ()
         draft.note(
-            "There is no named posture: optimizations start with all joints at zero or at the nearest limit, often "
+            "No posture has a name: optimizations start with all joints at zero or at the nearest limit, often "
             'straight and singular. Write a bent posture here, and default_posture = "start" above the tables:',
             "[postures.start]",
             *base,

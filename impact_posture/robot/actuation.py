@@ -110,7 +110,7 @@ def allocation_matrix(model: pin.Model, propulsion: PropulsionSpec) -> Array:
         fault = f"frame '{propulsion.frame}' is not on the base body"
         raise SpecError(fault, where="propulsion.frame", hint="name a frame that is fixed to the floating base")
     if not propulsion.rotors:
-        raise SpecError("there are no rotors", where="propulsion.rotors", hint="list them, or leave propulsion out")
+        raise SpecError("has no rotors", where="propulsion.rotors", hint="list them, or leave propulsion out")
     columns = []
     for rotor in propulsion.rotors:
         direction = np.asarray(rotor.direction, dtype=float)

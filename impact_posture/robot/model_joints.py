@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from impact_posture.errors import JointNotFound, PostureError, degrees_hint
 
-# Limits beyond this are no limits.  Pinocchio writes "no limit" as the largest double.
+# Larger limits count as missing.  Pinocchio writes "no limit" as the largest double.
 ENDLESS = 1e10
 
 

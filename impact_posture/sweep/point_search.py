@@ -1,6 +1,6 @@
 """Solve one point of a sweep from warm starts, and from random starts if the warm starts lead to different optima.
 
-The result has a certificate, or the reason why there is no certified posture.
+The result has a certificate, or the reason why no posture is certified.
 """
 
 from __future__ import annotations

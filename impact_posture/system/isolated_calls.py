@@ -20,7 +20,7 @@ _Result = TypeVar("_Result")
 
 # Memory that the calls may allocate, bytes: 1.5 times the memory for the largest mesh file.
 MOST_MEMORY = 3 << 30
-# A call that sleeps for this time, s, waits for a pipe or a device.  A wait for a disk is no sleep, except for FUSE.
+# A call that sleeps this long, s, waits for a pipe or a device.  Waiting for a disk is not sleep, except for FUSE.
 _LONGEST_SLEEP = 1.0
 _TOO_LARGE = "takes too much memory to read"
 # Time between two looks at a call, s.

@@ -216,7 +216,7 @@ def cache_path() -> Path:
             path = (base if base.is_absolute() else Path.home() / ".cache") / "impact-posture"
         str(path).encode("utf-8")
     except RuntimeError:
-        raise OutputError("there is no home folder", where="cache", hint="set IMPACT_POSTURE_CACHE") from None
+        raise OutputError("the user has no home folder", where="cache", hint="set IMPACT_POSTURE_CACHE") from None
     except UnicodeEncodeError:
         hint = "set IMPACT_POSTURE_CACHE to another folder"
         raise OutputError("is not UTF-8", where=str(path), hint=hint) from None
