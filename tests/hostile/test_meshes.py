@@ -19,6 +19,7 @@ from impact_posture.collision.mesh_file import UnusableShape, read_mesh, read_me
 from impact_posture.collision.shape_corners import shape_points
 from impact_posture.collision.swept_hull import fit_hull
 from impact_posture.collision.urdf_shapes import LinkShape
+from impact_posture.output import plot
 from tests.hostile.arena import SMALL, judging, strike
 from tests.support.urdfs import stl
 
@@ -188,7 +189,8 @@ def test_a_robot_without_its_bad_mesh(name: str, arena: Path) -> None:
     assert len(left_out) == 2 and all(name in line for line in left_out), outcome.err
 
 
-def test_a_report_without_a_bad_mesh(arena: Path) -> None:
+def test_a_report_without_a_bad_mesh(arena: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(plot, "FIGURES", {"jump": plot.FIGURES["jump"]})
     write(arena / "bad.ply", MESHES["huge index.ply"])
     with_mesh(arena, "bad.ply", "visual")
     outcome = strike(
