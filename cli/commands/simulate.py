@@ -149,7 +149,7 @@ def _show(page: Page, document: dict[str, Any], label: str, folder: Path, notes:
     ticks = sum(part["ticks"] for part in runs)
     rows += [
         ("relaxed", f"{count['relaxed_ticks']} of {ticks} ticks, in which limits made a task give way"),
-        ("held", f"{count['failed_ticks']} ticks, in which no command was found and the last one was kept"),
+        ("held", f"{count['failed_ticks']} ticks without a new command, in which the last one was kept"),
     ]
     if any(window["kind"] == "dwell" for window in document["windows"]):
         rows.append(("contacts", f"{count['contacts']} of {count['contacts_asked']}"))

@@ -98,7 +98,7 @@ def offline_posture(
             if (collision, stops, edges) == attempts[-1]:
                 raise
             if collision:
-                note = f"links may touch in the offline posture, because none without collisions was found: {error}"
+                note = f"links may touch in the offline posture, because none without collisions is known: {error}"
             continue
         value, initial = objective.value(solution.q), objective.value(solution.initial)
         moved = distance(Chart(setup.robot.model), solution.q, solution.initial)

@@ -186,7 +186,7 @@ def _losses(setup: Setup, run: Run) -> list[Event]:
         events.append(Event("control lost", float(series.t[np.argmax(relaxed)]), words))
     begin, length = _longest(series.held)
     if length * period > bounds.held + 1e-9:
-        words = f"no command was found for {length * period:.3g} s, the last one was held,"
+        words = f"the controller had no command for {length * period:.3g} s, the last one was held,"
         events.append(Event("control lost", float(series.t[begin]), words))
     if run.away is not None:
         events.append(Event("control lost", run.away, "the state ran away"))

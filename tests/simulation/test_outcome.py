@@ -106,7 +106,7 @@ def test_a_base_below_the_surface_or_its_start_fell(name: str) -> None:
         (RELAXED, 100, 500, None),
         (RELAXED, 100, 501, "50 % of all ticks"),
         (HELD, 300, 50, None),
-        (HELD, 300, 51, "no command was found for 0.051 s"),
+        (HELD, 300, 51, "the controller had no command for 0.051 s"),
     ],
 )
 def test_relaxed_and_held_ticks(status: int, begin: int, length: int, words: str | None) -> None:

@@ -85,8 +85,8 @@ class Evaluation(JsonBlock):
         compliance_effect: Relative change of H if the supports have a tenth of the compliance; ``None`` for a robot
             without supports.
         contact_stability: Whether the feet stay on the ground in the impact; ``None`` for a robot without supports.
-        standing: The impact if the ground can only push the feet; ``None`` for a robot without supports, or if there
-            is no such impact.
+        standing: The impact if the ground can only push the feet; ``None`` for a robot without supports, or without
+            such an impact.
         contacts: Separate evaluation of each contact, the leading contact first; empty if there is only one contact.
         impulses: Worst impulses of several contacts; ``None`` if there is only one contact.
         model_variants: Objective and scalars for each model variant; empty if there are no variants.
@@ -216,7 +216,7 @@ def evaluate(
         worst_normal=quantities.normal if cone is None else cone.normal,
         cone=cone,
         ellipsoid=ellipsoid_of(quantities.ellipsoid),
-        pose=oracle.numeric.at(q).placement(point_on(robot, objective.contact.frame)),
+        pose=oracle.at(q).numeric.placement(point_on(robot, objective.contact.frame)),
         speed=speed,
         restitution=restitution,
         frictionless=frictionless_jump(objective, quantities, rebound),

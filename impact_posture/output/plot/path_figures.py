@@ -253,7 +253,7 @@ def motion_figure(view: ResultView) -> Figure:
         shares.set_ylim(0.0, None)
         shares.set_ylabel("share of the limit  [1]")
         shares.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), handlelength=3.2)
-        shares.set_xlabel(f"time  [s]; path of {motion.length:.3g} rad (m), found by {motion.method}")
+        shares.set_xlabel(f"time  [s]; path of {motion.length:.3g} rad (m), by {motion.method}")
         for axes in (joints, objective, shares):
             axes.grid(True)
             for time in () if motion.strike is None else (motion.strike.run_up_s, motion.strike.contact_s):

@@ -14,7 +14,6 @@ from impact_posture.config.problem_settings import RESTITUTION, SPEED, Against
 from impact_posture.errors import InputError, MetricError
 from impact_posture.impact.evaluation.impact_effect import tangent_units
 from impact_posture.impact.evaluation.objective_value import objective_value
-from impact_posture.impact.impact_contact import point_on
 from impact_posture.impact.kinds.impact_kind import ImpactKind
 from impact_posture.impact.quantities.impact_oracle import ImpactOracle
 from impact_posture.impact.quantities.impact_quantities import ImpactQuantities
@@ -133,9 +132,8 @@ class ResultView:
 
     def jacobian(self, q: Array) -> Array:
         """Return the Jacobian ``J(q)`` of the world velocity of the contact point, shape (3, nv)."""
-        contact = self.objective.contact
-        point = point_on(self.robot, contact.frame, contact.offset)
-        return np.array(self.objective.oracle.numeric.at(q).jacobian(point)[:3])
+        oracle = self.objective.oracle.at(q)
+        return np.array(oracle.numeric.jacobian(oracle.point)[:3])
 
 
 def jump_unit(view: ResultView) -> str:

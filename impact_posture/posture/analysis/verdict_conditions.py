@@ -47,7 +47,7 @@ class Circumstances:
         attainable: Highest speed at which the joints can bring the contact to the surface in the optimal posture,
             m/s; ``None`` if unknown or unbounded.
         moved: Distance from the given to the initial posture, rad mixed with m.
-        no_path: Why no path to the optimum was found, and where the path ends; empty if it ends at the optimum.
+        no_path: Why no path leads to the optimum, and where the path ends; empty if it ends at the optimum.
     """
 
     attainable: float | None = None

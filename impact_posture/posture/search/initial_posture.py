@@ -50,8 +50,7 @@ def initial_posture(problem: ConstrainedProblem, seed: int, rows: ProgramRows) -
         )
     projection = Projector(problem).project(least.q)
     if projection.violation > FEASIBLE:
-        near = f"a posture within {projection.violation:.1e} of the constraints was found"
-        fault = f"{near}, but no posture that satisfies them"
+        fault = f"no known posture satisfies the constraints; the nearest misses them by {projection.violation:.1e}"
         raise SolverFailed(fault, where="problem", hint="start from a `posture` nearer to the target")
     return replace(least.problem, given=given), projection.q
 

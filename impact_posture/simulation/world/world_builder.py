@@ -197,7 +197,7 @@ def _point(surface: Surface, normal: Array, placed: list[tuple[Shape, pin.SE3]])
     if surface.point is not None:
         return np.array(surface.point, dtype=float)
     if not placed:
-        what = "has no point, and there is no shape that determines the point"
+        what = "has neither a point nor a shape that determines the point"
         raise InputError(what, where=f"surface '{surface.name}'", hint="give a point, or a shape")
     lowest = min((_lowest(*each, normal) for each in placed), key=lambda point: float(normal @ point))
     return np.asarray(lowest - surface.gap * normal)
