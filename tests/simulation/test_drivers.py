@@ -11,6 +11,7 @@ import pinocchio as pin
 import pytest
 
 from impact_posture.errors import SpecError
+from impact_posture.path.row_interpolation import RowInterpolation
 from impact_posture.simulation.controller_gains import EndEffectorGains, Gains
 from impact_posture.simulation.controllers.contact_reference import ReferencePoint
 from impact_posture.simulation.controllers.controller_factory import CONTROLLERS, ControllerFactory, Mode
@@ -102,11 +103,13 @@ def test_all_controllers_share_gains_tasks_and_weights(monkeypatch: pytest.Monke
         factory = shared_factory(name)
         # Formulations do not depend on the offline optimum or the path, so both are replaced.
         monkeypatch.setitem(vars(factory), "_optimum", lambda name, q=factory.setup.q: SimpleNamespace(q=q))
-        still = {"q": np.tile(factory.setup.q, (2, 1)), "v": np.zeros((2, factory.setup.robot.nv))}
-        path = SimpleNamespace(duration=0.0, t=np.array([0.0, 1.0]), a=still["v"], **still)
-        monkeypatch.setitem(vars(factory), "path", path)
+        rest = np.zeros((2, factory.setup.robot.nv))
+        still = RowInterpolation(
+            factory.setup.robot.model, np.array([0.0, 1.0]), np.tile(factory.setup.q, (2, 1)), rest, rest
+        )
+        monkeypatch.setitem(vars(factory), "path", SimpleNamespace(strike=None, duration=0.0, at=still.at))
         strike = SimpleNamespace(follow_through=None, run_up_s=0.0, contact_s=0.0)
-        monkeypatch.setitem(vars(factory), "strike", SimpleNamespace(strike=strike, **vars(path)))
+        monkeypatch.setitem(vars(factory), "strike", SimpleNamespace(strike=strike, duration=0.0, at=still.at))
         nominal = factory.driver("nominal").controller.formulation
         for controller in CONTROLLERS:
             formulation = factory.driver(controller).controller.formulation

@@ -236,7 +236,7 @@ def test_scenes_that_do_not_fit_the_robot_are_refused() -> None:
         (Scene((Surface("s", (0, 0, 1)),), (Shape("hand", (0.1,)),)), FrameNotFound, "panda_hand"),
         (Scene((Surface("s", (0, 0, 1)),), (Shape("panda_link0", (0.1,)),)), ContactError, "welded"),
         (Scene(shapes=(Shape("panda_hand_tcp", (0.1,)),)), InputError, "no center"),
-        (Scene((Surface("s", (0, 0, 1)),)), InputError, "no shape"),
+        (Scene((Surface("s", (0, 0, 1)),)), InputError, "neither a point nor a shape"),
     ):
         with pytest.raises(kind, match=words) as caught:
             build_world(robot, scene)
