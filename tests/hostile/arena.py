@@ -17,6 +17,7 @@ from pathlib import Path
 
 from impact_posture_cli.argv import put_right
 from impact_posture_cli.error_boundary import run
+from tests.experiment.conftest import shortened
 from tests.support.command import PARSER
 
 CODES = {0, 1, 2, 3, 4, 130, 143}
@@ -53,6 +54,12 @@ starts = 1
 [grid]
 speed = [1, 2]
 """
+
+
+def write_short_scenario(folder: Path) -> None:
+    """Write ``short.toml``, a scenario with one early contact."""
+    text = shortened("aerial-vertical", count=1, gap=0.1, settle=0.1, dwell=0.2, pause=0.05)
+    (folder / "short.toml").write_text(text, encoding="utf-8")
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.experiment.conftest import shortened
-from tests.hostile.arena import SWEEP, Outcome, judging, strike
+from tests.hostile.arena import SWEEP, Outcome, judging, strike, write_short_scenario
 
 COMMAND = str(Path(sys.executable).parent / "impact-posture")
 FAKETIME = next((str(path) for path in Path("/usr/lib").glob("*/faketime/libfaketime.so.1")), "")
@@ -44,8 +43,7 @@ CLOCKS = (
 
 
 def prepare(folder: Path) -> None:
-    text = shortened("aerial-vertical", count=1, settle=0.1, dwell=0.2, pause=0.05)
-    (folder / "short.toml").write_text(text, encoding="utf-8")
+    write_short_scenario(folder)
     (folder / "sweep.toml").write_text(SWEEP)
 
 

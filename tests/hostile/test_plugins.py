@@ -18,8 +18,7 @@ from matplotlib.figure import Figure
 
 import impact_posture.experiment.experiment_folders
 from impact_posture.simulation.controllers.controller_factory import GROUP
-from tests.experiment.conftest import shortened
-from tests.hostile.arena import judging, strike
+from tests.hostile.arena import judging, strike, write_short_scenario
 from tests.simulation.factories import needs_mujoco
 
 HEAD = """
@@ -104,8 +103,7 @@ def test_controllers_of_other_packages(
     needs_mujoco()
     figures = impact_posture.experiment.experiment_folders
     monkeypatch.setattr(figures, "figures_of_run", lambda views: {"snapshots": Figure(figsize=(1, 1))})
-    text = shortened("aerial-vertical", count=1, settle=0.1, dwell=0.2, pause=0.05)
-    (arena / "short.toml").write_text(text, encoding="utf-8")
+    write_short_scenario(arena)
     chosen = range(len(evil)) if hostile_full else random.Random(3).sample(range(len(evil)), 12)
     with judging() as judge:
         for k in chosen:

@@ -21,8 +21,7 @@ from matplotlib.figure import Figure
 
 import impact_posture.experiment.experiment_folders as folders
 from impact_posture.experiment.reproduction import reproduce
-from tests.experiment.conftest import shortened
-from tests.hostile.arena import judging, strike
+from tests.hostile.arena import judging, strike, write_short_scenario
 from tests.simulation.factories import needs_mujoco
 
 COUNT = 4
@@ -36,8 +35,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A folder with a short scenario and the store of its finished runs."""
     needs_mujoco()
     folder = tmp_path_factory.mktemp("finished")
-    text = shortened("aerial-vertical", count=1, settle=0.1, dwell=0.2, pause=0.05)
-    (folder / "short.toml").write_text(text, encoding="utf-8")
+    write_short_scenario(folder)
     with pytest.MonkeyPatch.context() as patch:
         # Jobs are stored with the path as it is typed.
         patch.chdir(folder)
