@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pinocchio as pin
 
 from impact_posture.impact.objective import Objective
+from impact_posture.path.row_interpolation import Moment
 from impact_posture.posture.constraints.requirements import Requirements
 from impact_posture.posture.loads.load_cases import load_cases
 from impact_posture.system.arrays import Array
 
 # If the rotors miss a base wrench by less than this share of the weight, the difference is ignored.
 _UNREACHABLE = 1e-7
+
+
+@dataclass(frozen=True)
+class Need:
+    """The largest share of a limit that a motion needs; ``of`` names the limit."""
+
+    share: float
+    of: str
 
 
 class ActuatorLimits:
@@ -28,7 +37,7 @@ class ActuatorLimits:
 
     def __init__(self, objective: Objective, q: Array, requirements: Requirements) -> None:
         robot = objective.robot
-        self._model = robot.model.copy()
+        self._model, self._velocities = robot.model.copy(), robot.tangent_names
         # Motor rotors turn with their joints during a motion, so the armature counts in every joint model.
         self._model.armature = np.where(np.isfinite(robot.armature), robot.armature, 0.0)
         self._data = self._model.createData()
@@ -64,6 +73,23 @@ class ActuatorLimits:
         as possible.  Return ``None`` if rotors or friction do not allow the load.
         """
         return None if self._out_of_reach(load) else self._equilibrium.shares(q, load)
+
+    def need(self, moment: Moment, speeds: Array, part: float = 1.0) -> Need:
+        """Return the largest share of a limit in ``q``, ``ν``, ``ν̇``; infinite if rotors or friction do not allow it.
+
+        ``speeds`` are the velocity limits, shape (nv,).  Torques and thrusts may use only ``part`` of their ranges.
+        """
+        q, v, a = moment
+        rates = np.abs(v) / speeds
+        velocity = Need(float(rates.max()), f"the velocity of {self._velocities[int(rates.argmax())]}")
+        shares = np.zeros(0) if self.missing else self.shares(q, self.load(q, v, a))
+        if shares is None:
+            return Need(np.inf, "the balance of the base")
+        if not shares.size:
+            return velocity
+        k = int(np.abs(shares).argmax())
+        actuator = Need(float(np.abs(shares[k])) / part, f"the {self.kinds[k]} of {self.names[k]}")
+        return max(velocity, actuator, key=lambda need: need.share)
 
     def _out_of_reach(self, load: Array) -> bool:
         wrench = self._unreachable @ load[: self._unreachable.shape[1]] if len(self._unreachable) else np.zeros(0)

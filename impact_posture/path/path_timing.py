@@ -139,12 +139,8 @@ def timed(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedCu
 
 def _exceeded(space: PathSpace, motion: TimedCurve, limits: ActuatorLimits) -> float:
     """Return the largest share of a limit that a motion with a fixed base needs, at its rows and between them."""
-    largest = 0.0
-    for q, v, a in map(motion.rows.at, motion.instants):
-        used = limits.shares(q, limits.load(q, v, a))
-        speed = float((np.abs(v) / space.problem.robot.velocity_limits).max())
-        largest = max(largest, speed, float(np.abs(used).max(initial=0.0)) if used is not None else np.inf)
-    return largest
+    speeds = space.problem.robot.velocity_limits
+    return max(limits.need(motion.rows.at(t), speeds).share for t in motion.instants)
 
 
 @dataclass(frozen=True, eq=False)

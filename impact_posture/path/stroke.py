@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
 
 from impact_posture.dynamics.numeric import Numeric
-from impact_posture.path.actuator_limits import ActuatorLimits
+from impact_posture.path.actuator_limits import ActuatorLimits, Need
 from impact_posture.path.path_curve import DEVIATION, PathCurve
 from impact_posture.path.path_space import STEP, PathSpace
 from impact_posture.path.time_law import TimeLaw, polynomial, whole
@@ -41,14 +40,6 @@ _SHARE = 0.95
 _SINGULAR, _BENT = "a posture that is nearly singular", "a sharp bend of the constraints"
 # Progress over τ = t/T, highest power first: the speed rises as 3τ² − 2τ³ to its end value, or falls from it.
 _RISING, _FALLING = np.array([-1.0, 2.0, 0.0, 0.0, 0.0]), np.array([1.0, -2.0, 0.0, 2.0, 0.0])
-
-
-@dataclass(frozen=True)
-class Need:
-    """The largest share of a limit that a motion needs; ``of`` names the limit."""
-
-    share: float
-    of: str
 
 
 class Stroke:
@@ -133,21 +124,11 @@ class Stroke:
         The velocity at ``q`` counts as permitted, because a velocity jump may exceed the limits.
         """
         assert self.curve is not None  # noqa: S101 (narrows a type)
-        robot, law, worst = self._space.problem.robot, self.law(duration, factor), Need(0.0, "")
-        allowed = np.maximum(robot.velocity_limits, factor * np.abs(self._u) * (1 + 1e-9))
+        law, worst = self.law(duration, factor), Need(0.0, "")
+        allowed = np.maximum(self._space.problem.robot.velocity_limits, factor * np.abs(self._u) * (1 + 1e-9))
         for t in np.linspace(0.0, law.duration, _INSTANTS):
-            q, v, a = moment(self.curve, law, float(t))
-            speeds = np.abs(v) / allowed
-            needs = [Need(float(speeds.max()), f"the velocity of {robot.tangent_names[int(speeds.argmax())]}")]
-            if not limits.missing:
-                shares = limits.shares(q, limits.load(q, v, a))
-                if shares is None:
-                    needs.append(Need(np.inf, "the balance of the base"))
-                elif shares.size:
-                    k = int(np.abs(shares).argmax())
-                    limit = f"the {limits.kinds[k]} of {limits.names[k]}"
-                    needs.append(Need(float(np.abs(shares[k])) / _SHARE, limit))
-            worst = max([worst, *needs], key=lambda need: need.share)
+            needed = limits.need(moment(self.curve, law, float(t)), allowed, _SHARE)
+            worst = max(worst, needed, key=lambda need: need.share)
             if stop and worst.share > 1:
                 break
         return worst
