@@ -103,13 +103,7 @@ def whole_folder(out: Path, *, force: bool, kind: Kind, products: Sequence[str] 
             with signals_held():
                 _replace(beside, out, force, kind)
     except OSError as error:
-        reason = error.strerror or str(error)
-        if isinstance(error, FileNotFoundError) and error.filename:
-            # Name the missing file, because it may be outside the folder.
-            reason = f"{reason}: {error.filename}"
-        fault = f"cannot be written ({reason})"
-        hint = remedy(error, "free space or choose another `out`")
-        raise OutputError(fault, where=str(out), hint=hint) from error
+        raise _unwritable(out, error, "free space or choose another `out`") from error
 
 
 @contextmanager
@@ -138,7 +132,18 @@ def added_files(folder: Path, *, force: bool) -> Iterator[Path]:
                 (new / RECORD).write_text(extended_record(folder, new), encoding="utf-8")
                 _move([*names, RECORD], new, folder, old, force)
     except OSError as error:
-        raise OutputError.unwritable(folder, error, "free space or choose another folder") from error
+        raise _unwritable(folder, error, "free space or choose another folder") from error
+
+
+def _unwritable(out: Path, error: OSError, hint: str) -> OutputError:
+    """Return the error for a folder that cannot be written; it names a file outside the folder that is the cause."""
+    cause = Path(os.fsdecode(error.filename)) if isinstance(error.filename, str | bytes) else out
+    whole = out.absolute()
+    inside = whole in (cause, *cause.parents) or cause == whole.parent
+    if inside or any(part.startswith(SCRATCH) for part in cause.parts):
+        return OutputError.unwritable(out, error, hint)
+    fault = f"cannot be written, because of {cause} ({error.strerror})"
+    return OutputError(fault, where=str(out), hint=remedy(error, "check that file and its permissions"))
 
 
 def _move(names: Sequence[str], new: Path, out: Path, old: Path, force: bool) -> None:

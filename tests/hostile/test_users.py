@@ -11,6 +11,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import matplotlib
 import pytest
 
 from impact_posture.output import plot
@@ -53,6 +54,8 @@ def become(user: int, home: Path, **variables: str) -> Callable[[], None]:
         os.setgid(user)
         os.setuid(user)
         tempfile.tempdir = None
+        # Matplotlib has remembered a folder in the home of root.
+        matplotlib.get_configdir.cache_clear()
         for name in ("IMPACT_POSTURE_CACHE", "XDG_CACHE_HOME", "MPLCONFIGDIR", "TMPDIR"):
             os.environ.pop(name, None)
         os.environ.update({"HOME": str(home), **variables})

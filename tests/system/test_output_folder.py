@@ -371,6 +371,17 @@ with whole_folder(Path(sys.argv[1], "out"), force=False, kind="result") as folde
 """
 
 
+@pytest.mark.parametrize("writing", ["whole", "added"])
+def test_a_file_elsewhere_that_fails_is_named(writing: str, tmp_path: Path) -> None:
+    other, out = tmp_path / "style.txt", tmp_path / "out"
+    folder = whole_folder(out, force=False, kind="result") if writing == "whole" else added_files(out, force=False)
+    with pytest.raises(OutputError) as caught, folder:
+        other.read_text()
+    assert str(other) in caught.value.what
+    assert "space" not in caught.value.hint
+    assert os.listdir(tmp_path) == []
+
+
 def test_a_folder_of_a_killed_command_in_a_result_is_not_foreign(tmp_path: Path) -> None:
     write(tmp_path / "out", "one")
     killed = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path / "out")], check=False, timeout=60)
