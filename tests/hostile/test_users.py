@@ -11,7 +11,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import matplotlib
+import matplotlib.style  # noqa: F401 (reads a folder in the home of root, which other users cannot)
 import pytest
 
 from impact_posture.output import plot
@@ -54,8 +54,6 @@ def become(user: int, home: Path, **variables: str) -> Callable[[], None]:
         os.setgid(user)
         os.setuid(user)
         tempfile.tempdir = None
-        # Matplotlib has remembered a folder in the home of root.
-        matplotlib.get_configdir.cache_clear()
         for name in ("IMPACT_POSTURE_CACHE", "XDG_CACHE_HOME", "MPLCONFIGDIR", "TMPDIR"):
             os.environ.pop(name, None)
         os.environ.update({"HOME": str(home), **variables})
