@@ -158,18 +158,21 @@ class BatchDescent:
         return _State(**vars(point), **new, tag=tag)
 
     def _points(self, x: Array) -> _Points:
-        at = self.manifold.evaluate(x)
-        free = np.ones(at.gradient.shape, dtype=bool)
+        at, nv = self.manifold.evaluate(x), self.manifold.chart.nv
+        free, rows = np.ones(at.gradient.shape, dtype=bool), np.arange(len(x))
+        jacobian, rest = np.empty_like(at.jacobian), np.empty_like(at.gradient)
+        inverse, multipliers = np.empty((len(x), nv, jacobian.shape[1])), np.empty(at.equalities.shape)
         for _ in range(_ACTIVE_SETS):
-            jacobian = np.where(free[:, None, :], at.jacobian, 0.0)
-            inverse = right_inverse(jacobian)
+            jacobian[rows] = np.where(free[rows, None, :], at.jacobian[rows], 0.0)
+            inverse[rows] = right_inverse(jacobian[rows])
             # The gradient minus the forces of the equalities: at a limit, its sign says whether the limit is active.
-            multipliers = times(inverse.transpose(0, 2, 1), at.gradient)
-            rest = at.gradient - times(at.jacobian.transpose(0, 2, 1), multipliers)
+            multipliers[rows] = times(inverse[rows].transpose(0, 2, 1), at.gradient[rows])
+            rest[rows] = at.gradient[rows] - times(at.jacobian[rows].transpose(0, 2, 1), multipliers[rows])
             before, free = free, ~self.manifold.blocked(x, -rest)
-            if (free == before).all():
+            rows = np.flatnonzero((free != before).any(axis=1))
+            if not rows.size:
                 break
-        tangent = before[:, :, None] * np.eye(self.manifold.chart.nv) - inverse @ jacobian
+        tangent = before[:, :, None] * np.eye(nv) - inverse @ jacobian
         back = self.manifold.back(x, at.equalities, jacobian, inverse)
         residual = np.abs(at.equalities).max(axis=1, initial=0.0)
         merit = at.merit - (multipliers * at.equalities).sum(axis=1)

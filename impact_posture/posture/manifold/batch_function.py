@@ -15,8 +15,8 @@ import numpy as np
 
 from impact_posture.system.arrays import Array
 
-# Numbers of postures in a run of the operations.  With fewer postures, the calls of NumPy take most of the time.
-_NARROW, _WIDTH = 128, 512
+# Number of postures in a run of the operations.  With fewer postures, the calls of NumPy take most of the time.
+_WIDTH = 512
 # CasADi evaluates smaller batches in less time.
 _SMALL = 64
 
@@ -54,7 +54,6 @@ class BatchFunction:
 
     def __init__(self, inputs: list[ca.SX], outputs: list[ca.SX]) -> None:
         self._expressions = inputs, [ca.densify(output) for output in outputs]
-        self._programs = dict[int, _Program]()
 
     def __call__(self, *inputs: Array) -> list[Array]:
         """Return the outputs at each row of the inputs, shape (N, rows, columns)."""
@@ -75,9 +74,7 @@ class BatchFunction:
         ]
 
     def _together(self, inputs: list[Array]) -> list[Array]:
-        count = len(inputs[0])
-        width = _NARROW if count <= _NARROW else _WIDTH
-        program = self._programs.get(width) or self._programs.setdefault(width, self._program(width))
+        count, program = len(inputs[0]), self._program
         for row, value in zip(program.inputs, inputs, strict=True):
             row[:, :count] = value.T
             # The remaining columns repeat a posture, so that they raise no error.
@@ -110,18 +107,19 @@ class BatchFunction:
             operations.append((code, function.instruction_input(k), function.instruction_output(k), constant))
         return operations
 
-    def _program(self, width: int) -> _Program:
-        """Return the operations with arrays for ``width`` postures."""
+    @cached_property
+    def _program(self) -> _Program:
+        """The operations with arrays for ``_WIDTH`` postures."""
         function, operations = self._function, self._operations
         assert operations is not None  # noqa: S101 (narrows a type)
-        inputs = [np.zeros((function.nnz_in(k), width)) for k in range(function.n_in())]
-        outputs = [np.zeros((function.nnz_out(k), width)) for k in range(function.n_out())]
-        calls, own = list[tuple[Callable[..., Any], tuple[Array, ...]]](), list(np.zeros((function.sz_w(), width)))
+        inputs = [np.zeros((function.nnz_in(k), _WIDTH)) for k in range(function.n_in())]
+        outputs = [np.zeros((function.nnz_out(k), _WIDTH)) for k in range(function.n_out())]
+        calls, own = list[tuple[Callable[..., Any], tuple[Array, ...]]](), list(np.zeros((function.sz_w(), _WIDTH)))
         # For each register of the function, the array that currently contains its value.
         at, constants = [*own], dict[float, Array]()
         for code, sources, targets, constant in operations:
             if code == ca.OP_CONST:
-                at[targets[0]] = constants.setdefault(constant, np.full(width, constant))
+                at[targets[0]] = constants.setdefault(constant, np.full(_WIDTH, constant))
             elif code == ca.OP_INPUT:
                 at[targets[0]] = inputs[sources[0]][sources[1]]
             elif code == ca.OP_OUTPUT:
