@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 JOBS ?= 2
 
-.PHONY: help demo test coverage wheel test-wheel lowest lint types docs bench bench-gpu study-impacts study-elastic study-hits study-global study-feasible study-flow study-robustness study-real-impacts study-verdict study-robots study-scan study-controller study-sweep study-hostile reproduction calibration regression
+.PHONY: help demo test coverage wheel test-wheel lowest lint types docs bench bench-gpu study-impacts study-elastic study-hits study-global study-feasible study-flow study-robustness study-strikes study-real-impacts study-verdict study-robots study-scan study-controller study-sweep study-hostile reproduction calibration regression
 .PHONY: pictures viewer clean
 
 help:
@@ -25,6 +25,7 @@ help:
 	@echo "make reproduction   run the experiments of the paper with many seeds, for the documentation (about ten minutes)"
 	@echo "make study-feasible  measure the effect of collision constraints, limits at rest and approach speed"
 	@echo "make study-flow     run the reference flow from 1,000 random starts for each of four seeds (three minutes)"
+	@echo "make study-strikes  simulate planned strikes beside strikes from other postures (an hour)"
 	@echo "make study-real-impacts  compare the rigid model with MuJoCo for throws, strikes and taps (some minutes)"
 	@echo "make study-verdict  simulate the impacts of verdicts, and compare each number (some minutes)"
 	@echo "make study-robustness  measure where each controller helps and which targets it meets (ten minutes; can continue after an interruption)"
@@ -147,6 +148,9 @@ study-robots: $(VENV)/.installed-test
 
 study-scan: $(VENV)/.installed-test
 	$(BIN)/python -m docs.studies scan --write
+
+study-strikes: $(VENV)/.installed-test
+	$(BIN)/python -m docs.studies strikes --jobs $(JOBS) --write
 
 study-real-impacts: $(VENV)/.installed-test
 	$(BIN)/python -m docs.studies real-impacts --jobs $(JOBS) --write

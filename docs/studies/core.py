@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import platform
 import statistics
@@ -13,7 +14,7 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import pinocchio as pin
@@ -84,6 +85,7 @@ STUDIES = {
         Study("search", "search_quality:arms", "the default search and 16 starts; seeds", 3, target="study-global"),
         Study("search-catalogue", "search_quality:catalogue", "the same for the catalogue; seeds", 3, page=False),
         Study("flow", "flow", "where the reference flow rests, from random starts", 1000, target="study-flow"),
+        Study("strikes", "strikes", "planned strikes beside others; seeds", 10, target="study-strikes"),
         Study("real-impacts", "real_impacts", "balls, strikes, taps, as predicted", target="study-real-impacts"),
         Study("points", "robustness.study:points", "runs the points of the next two; random draws", 40, page=False),
         Study("robustness", "robustness.study", "where each controller helps", target="study-robustness"),
@@ -136,6 +138,15 @@ def collected(work: Callable[[int], _T], count: int, jobs: int, what: str) -> li
             say(f"\r{what}: {len(results_by_index)} of {count}", end="")
     say("")
     return [results_by_index[k] for k in range(count)]
+
+
+def kept(file: Path, compute: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """Return the JSON content of a file, which is computed and written if the file does not exist."""
+    if not file.is_file():
+        content = compute()
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(json.dumps(content), encoding="utf-8")
+    return dict(json.loads(file.read_text(encoding="utf-8")))
 
 
 def table(head: Sequence[str], rows: Iterator[Sequence[str]] | Sequence[Sequence[str]]) -> Iterator[str]:

@@ -6,14 +6,13 @@ controller reaches if the robot moves exactly as planned.  Finished runs are sto
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from docs.studies.core import ROOT, Request, collected, table
+from docs.studies.core import ROOT, Request, collected, kept, table
 from impact_posture.errors import ImpactPostureError, MetricError
 from impact_posture.experiment.job_store import key_of
 from impact_posture.experiment.jobs import Job, execute
@@ -85,21 +84,20 @@ def result(scenario: str, name: str) -> dict[str, Any]:
     """Return prediction and run of a controller.  The result is stored under a hash of scenario, robot and code."""
     shipped = scenario.split()[0]
     key = key_of(Job(shipped, name, 0, compile="auto"))[:12]
-    kept = FOLDER / f"{scenario.replace(' ', '-')}-{name}-{key}.json"
-    if kept.is_file():
-        return dict(json.loads(kept.read_text(encoding="utf-8")))
-    try:
-        factory = ControllerFactory(set_up(scenario_of(scenario)))
-        before = predicted(factory, name)
-        _, document = execute(Job(shipped, name, 0, compile="auto"), factory)
+
+    def compute() -> dict[str, Any]:
+        try:
+            factory = ControllerFactory(set_up(scenario_of(scenario)))
+            before = predicted(factory, name)
+            _, document = execute(Job(shipped, name, 0, compile="auto"), factory)
+        except ImpactPostureError as error:
+            return {"predicted": None, "status": "no answer", "metrics": None, "offline": "", "why": error.line}
         answer = {"predicted": before, "status": document["status"], "metrics": document["metrics"]}
         answer["offline"] = (document["offline"] or {}).get("note", "")
         answer["why"] = "; ".join(dict.fromkeys(event["what"] for event in document["events"]))
-    except ImpactPostureError as error:
-        answer = {"predicted": None, "status": "no answer", "metrics": None, "offline": "", "why": error.line}
-    FOLDER.mkdir(parents=True, exist_ok=True)
-    kept.write_text(json.dumps(answer), encoding="utf-8")
-    return answer
+        return answer
+
+    return kept(FOLDER / f"{scenario.replace(' ', '-')}-{name}-{key}.json", compute)
 
 
 def lines(request: Request) -> Iterator[str]:

@@ -182,14 +182,12 @@ class _Loop:
 def _contacts(loop: _Loop, task: RepeatedContacts, mode: Mode) -> Run:
     driver, reference = loop.driver, Reference(task, loop.setup.gap)
     loop.check_length(reference.total)
-    # Time from the start of an approach until the reference reaches the surface.
-    crossing = reference.inward - 2 * task.beyond / task.speed
     starts = [reference.start(k) for k in range(task.count)]
     events = [(BRACE, driver.brace)]
     if mode == "held":
         events.append((max(BRACE, starts[0] - 2 * loop.ramp), driver.hold))
     # At the start of each approach, tell the controller the expected time of the impact.
-    events += [(start, partial(driver.expect, start + crossing)) for start in starts]
+    events += [(start, partial(driver.expect, start + reference.crossing)) for start in starts]
     events.sort(key=lambda event: event[0])
     left = round(reference.total / loop.period)
     while left and loop.away is None:
@@ -202,7 +200,7 @@ def _contacts(loop: _Loop, task: RepeatedContacts, mode: Mode) -> Run:
     for k, start in enumerate(starts):
         end = start + reference.cycle
         touch = loop.recorder.first_touch(start, end)
-        begin = start + crossing if touch is None else touch
+        begin = start + reference.crossing if touch is None else touch
         leaves = start + reference.inward + task.dwell
         ends = {"impact": begin + task.window, "dwell": max(leaves, begin), "recovery": min(begin + RECOVERY, end)}
         windows += [Window(kind, k, begin, until, touch is not None) for kind, until in ends.items()]

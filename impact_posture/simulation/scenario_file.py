@@ -6,12 +6,12 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
 from impact_posture.config.checked import checked
-from impact_posture.config.demand import Direction, Finite, NonNegative, OneOrMore, Positive, Share, Vector3
+from impact_posture.config.demand import Direction, Finite, NonNegative, OneOrMore, Positive, Share, Vector3, between
 from impact_posture.config.problem_settings import FRICTION, RobotSettings
 from impact_posture.config.table_validation import StrictTable, read_toml, validate
 from impact_posture.errors import InputError, ScenarioNotFound, SpecError, shown
@@ -113,11 +113,17 @@ class Spread(StrictTable):
         joints: Change of each joint at the start, rad or m.
         speed: Relative change of the speed of the impact, or of the force of the push.
         friction: Relative change of the friction of surfaces and of a thrown ball.
+        normal: Tilt of the surface of contacts about the expected contact point, degrees.
+        gap: Shift of the surface of contacts along its normal, m.
+
+    The controllers do not know ``normal`` and ``gap``.
     """
 
     joints: NonNegative = 0.0
     speed: Share = 0.0
     friction: Share = 0.0
+    normal: Annotated[float, between(0, 45, "degrees")] = 0.0
+    gap: NonNegative = 0.0
 
 
 @checked
@@ -163,6 +169,10 @@ class ScenarioTable(Scene, RobotSettings):
             both = "both " + " and ".join(f"[{key}]" for key in tasks)
             what = both if tasks else "neither [contacts], [push] nor [throw]"
             raise InputError(f"has {what}", hint="give exactly one of them")
+        if self.contacts is None and (self.spread.normal or self.spread.gap):
+            raise InputError(
+                "has a spread of the surface, but no [contacts]", hint="remove spread.normal and spread.gap"
+            )
         (task, content), shapes = tasks.popitem(), [s.frame for s in self.shapes]
         names = [] if self.contacts is None else [("surface", self.contacts.surface, [s.name for s in self.surfaces])]
         for key, name, known in (*names, *([] if self.push else [("frame", content.frame, shapes)])):

@@ -1,4 +1,4 @@
-"""Changes of a scenario by its seed: the start posture, the speed or force of the impact, and the friction.
+"""Changes of a scenario by its seed: start posture, speed or force of the impact, friction, place of the surface.
 
 Seed 0 is the scenario as its file states it.  Every controller gets the same changes for the same seed.
 """
@@ -11,11 +11,14 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 
+from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import Infeasible
+from impact_posture.impact.impact_contact import point_on
+from impact_posture.impact.worst_case.worst_normal import cone_axes
 from impact_posture.posture.constraints.requirements import Requirements
 from impact_posture.posture.formulation.build_problem import build_problem
 from impact_posture.posture.manifold.feasible_start import Projector
-from impact_posture.simulation.scenario_file import RepeatedContacts, Scenario, SinglePush
+from impact_posture.simulation.scenario_file import RepeatedContacts, Scenario, SinglePush, Spread
 from impact_posture.simulation.scenario_objective import scenario_objective
 from impact_posture.simulation.setup import Setup, set_up
 from impact_posture.simulation.world.world import build_world
@@ -37,15 +40,29 @@ def set_up_with(scenario: Scenario, seed: int) -> Setup:
         Infeasible: The feet of a standing robot cannot keep their places at any drawn start.
     """
     spread = scenario.spread
-    if seed == 0 or not (spread.joints or spread.speed or spread.friction):
+    if seed == 0 or spread == Spread():
         return set_up(scenario)
     generator = np.random.default_rng([seed, zlib.crc32(scenario.name.encode())])
     speed, friction = 1 + np.array([spread.speed, spread.friction]) * generator.uniform(-1, 1, 2)
     setup = set_up(_scaled(scenario, float(speed), float(friction)))
-    if not spread.joints:
-        return setup
-    q = _start(setup, spread.joints, generator)
-    return Setup(setup.scenario, setup.robot, q, build_world(setup.robot, setup.scenario, q, setup.scenario.throw))
+    if spread.joints:
+        q, changed = _start(setup, spread.joints, generator), setup.scenario
+        setup = replace(setup, q=q, world=build_world(setup.robot, changed, q, changed.throw))
+    return _displaced(setup, generator) if spread.normal or spread.gap else setup
+
+
+def _displaced(setup: Setup, generator: np.random.Generator) -> Setup:
+    """Return the scenario in a world whose surface is not quite where the controllers expect it."""
+    scenario, robot, n, spread = setup.scenario, setup.robot, setup.scenario.normal, setup.scenario.spread
+    angle, heading, shift = generator.uniform(-1, 1, 3) * [np.deg2rad(spread.normal), np.pi, spread.gap]
+    across = cone_axes(n)[:, 1:] @ [np.cos(heading), np.sin(heading)]
+    placement = Numeric(robot.model).at(setup.q).placement(point_on(robot, scenario.shape.frame, scenario.offset))
+    nx, ny, nz = (np.cos(angle) * n + np.sin(angle) * across).tolist()
+    x, y, z = (placement.translation - (setup.gap + shift) * n).tolist()
+    displaced = replace(scenario.surface, normal=(nx, ny, nz), point=(x, y, z))
+    surfaces = tuple(displaced if s == scenario.surface else s for s in scenario.surfaces)
+    world = build_world(robot, replace(scenario, surfaces=surfaces), setup.q)
+    return replace(setup, world=world, expected_gap=setup.gap)
 
 
 def _scaled(scenario: Scenario, speed: float, friction: float) -> Scenario:

@@ -30,16 +30,21 @@ class Setup:
         robot: Robot of the scenario.
         q: Start posture, shape (nq,).
         world: Simulated world before its first reset.
+        expected_gap: Distance between shape and surface at the start that controllers expect, m; ``None`` if they
+            know the true distance.
     """
 
     scenario: Scenario
     robot: Robot
     q: Array
     world: World
+    expected_gap: float | None = None
 
     @property
     def gap(self) -> float:
-        """Distance between shape and surface at the start, m; InputError if the scenario has no contacts."""
+        """Expected distance of shape and surface at the start, m; InputError if the scenario has no contacts."""
+        if self.expected_gap is not None:
+            return self.expected_gap
         return self.world.built.gaps[self.scenario.surface.name, self.scenario.shape.frame]
 
     @property

@@ -96,7 +96,7 @@ def _task(setup: Setup, model: Any) -> Iterable[tuple[str, Iterable[float]]]:
         yield "touching", [[shape.frame for shape in scenario.shapes].index(task.frame)]
         yield "inward", -scenario.normal
         yield "contacts", [task.count, task.settle, task.dwell, task.window, reference.inward, reference.cycle]
-        yield "crossing", [reference.inward - 2 * task.beyond / task.speed]
+        yield "crossing", [reference.crossing]
         for leg in reference.legs:
             yield "leg", leg
     elif isinstance(task, SinglePush):

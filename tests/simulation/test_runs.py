@@ -141,7 +141,7 @@ def test_windows_begin_at_the_first_touch(name: str) -> None:
         part = series.slice(impact.begin, impact.end)
         assert part.stop - part.start == 300
         # The contact is never earlier than the reference, but may be late while the robot still reconfigures.
-        crossing = task.settle + reference.inward - 2 * task.beyond / task.speed
+        crossing = task.settle + reference.crossing
         assert crossing - 0.03 < impact.begin < (crossing + 0.03 if controller == "nominal" else leaves)
 
 

@@ -9,6 +9,7 @@ import pinocchio as pin
 import pytest
 
 from impact_posture.dynamics.numeric import Numeric
+from impact_posture.errors import InputError
 from impact_posture.experiment.jobs import controller_factory
 from impact_posture.impact.impact_contact import point_on
 from impact_posture.simulation.scenario_file import Spread, read_scenario
@@ -58,3 +59,21 @@ def test_without_spread_a_seed_changes_only_the_noise() -> None:
     scenario = replace(read_scenario("aerial-vertical"), spread=Spread())
     np.testing.assert_array_equal(set_up_with(scenario, 3).q, set_up_with(scenario, 0).q)
     assert set_up_with(scenario, 3).scenario == scenario
+
+
+def test_controllers_do_not_know_where_the_surface_is() -> None:
+    scenario = replace(read_scenario("panda-tap"), spread=Spread(normal=5, gap=0.005))
+    stated, first, second = (set_up_with(scenario, seed) for seed in (0, 1, 2))
+    assert first.scenario == scenario and first.gap == stated.gap == pytest.approx(0.1)
+    tilts, shifts = [], []
+    for setup in (first, second):
+        normal, point = setup.world.built.normals["table"], setup.world.built.points["table"]
+        tilts.append(np.degrees(np.arccos(normal @ scenario.normal)))
+        shifts.append(scenario.normal @ (stated.world.built.points["table"] - point))
+    assert 0.01 < abs(tilts[0] - tilts[1]) and max(tilts) < 5
+    assert 1e-5 < abs(shifts[0] - shifts[1]) and np.abs(shifts).max() < 0.005
+
+
+def test_the_surface_of_a_push_cannot_vary() -> None:
+    with pytest.raises(InputError, match=r"no \[contacts\]"):
+        replace(read_scenario("solo8-push"), spread=Spread(gap=0.005))

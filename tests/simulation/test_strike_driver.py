@@ -38,7 +38,7 @@ def expected(factory: ControllerFactory) -> list[float]:
     task = factory.setup.scenario.contacts
     assert isinstance(task, RepeatedContacts)
     reference = Reference(task, factory.setup.gap)
-    return [reference.start(k) + reference.inward - 2 * task.beyond / task.speed for k in range(task.count)]
+    return [reference.start(k) + reference.crossing for k in range(task.count)]
 
 
 @cache

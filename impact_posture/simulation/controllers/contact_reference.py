@@ -30,6 +30,7 @@ class Reference:
 
     Attributes:
         inward: Duration of the approach, s.
+        crossing: Time from the start of an approach until the reference reaches the surface, s.
         cycle: Time from the start of an approach to the start of the next approach, s.
         total: Duration of the run, s.
         legs: Segments of constant acceleration, each with duration (s), acceleration (m/s²), initial distance (m) and
@@ -60,6 +61,7 @@ class Reference:
         ]
         self.task, self.legs = task, (*inward, *rest)
         self._ends = [float(end) for end in accumulate(leg[0] for leg in self.legs)]
+        self.crossing = self._ends[1]
         self.inward, self.cycle = self._ends[len(inward) - 1], self._ends[-1]
         self.total = task.settle + task.count * self.cycle
 

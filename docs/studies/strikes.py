@@ -1,0 +1,151 @@
+"""Simulate planned strikes beside strikes from the nominal posture and with the reference flow.
+
+A seed varies the speed, and the tilt and the place of the surface, which the controllers do not know.  Finished runs
+are stored in build/strikes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from statistics import mean, median
+from typing import Any
+
+import numpy as np
+
+from docs.studies.core import ROOT, Request, collected, kept, table
+from docs.studies.real_impacts import scenario_of
+from impact_posture.errors import ImpactPostureError
+from impact_posture.experiment.job_store import key_of
+from impact_posture.experiment.jobs import Job, execute
+from impact_posture.simulation.controllers.contact_reference import Reference
+from impact_posture.simulation.controllers.controller_factory import ControllerFactory
+from impact_posture.simulation.metrics import saturated
+from impact_posture.simulation.offline_posture import OfflinePosture, offline_posture
+from impact_posture.simulation.scenario_file import RepeatedContacts, Scenario, Spread
+from impact_posture.simulation.seed_variation import set_up_with
+from impact_posture.simulation.setup import set_up
+
+# A number after a name replaces the approach speed of the scenario, m/s.
+CASES = (
+    "ur5-strike", "panda-tap", "aerial-vertical", "aerial-lateral", "g1-strike 0.5", "g1-strike", "talos-strike 0.5",
+    "talos-strike"
+)  # fmt: skip
+CONTROLLERS = ("strike", "nominal", "robust-flow")
+SPREAD = Spread(speed=0.1, normal=5.0, gap=0.005)
+# Bars: share of the stated speed, s, s, and share of the predicted jump.
+SPEED, INSTANT, SATURATED, RATIO = 0.05, 0.01, 0.0, 0.15
+HEAD = (
+    "controller", "contact speed, error in %", "contact instant, error in ms", "saturated before, ms",
+    "measured / predicted jump", "jump, of nominal", "completed", "bars missed",
+)  # fmt: skip
+FOLDER = ROOT / "build" / "strikes"
+
+
+def varied(case: str) -> tuple[Scenario, RepeatedContacts]:
+    """Return the scenario of a case with the spread and a single contact, and its contact."""
+    scenario = scenario_of(case)
+    assert isinstance(scenario.task, RepeatedContacts)
+    task = replace(scenario.task, count=1)
+    return replace(scenario, spread=SPREAD, contacts=task), task
+
+
+def struck(case: str, name: str, seed: int, offline: Callable[..., OfflinePosture]) -> dict[str, Any]:
+    """Run a controller with a seed.  Return the errors at the contact and the outcome."""
+    scenario, _ = varied(case)
+    setup = set_up_with(scenario, seed)
+    task = setup.scenario.task
+    assert isinstance(task, RepeatedContacts)
+    try:
+        (record,), document = execute(
+            Job(case.split()[0], name, seed, compile="auto"), ControllerFactory(setup, offline_of=offline)
+        )
+    except ImpactPostureError as error:
+        return {"status": "no answer", "why": error.line, "plan": None, "contact": None}
+    (window,), (part,), reference = record.of("impact"), document["runs"], Reference(task, setup.gap)
+    # The surface is farther than expected by this distance, m.
+    stated, true = (each.world.built.points[task.surface] for each in (set_up(scenario), setup))
+    due = reference.start(0) + reference.crossing + scenario.normal @ (stated - true) / task.speed
+    before = record.series.slice(reference.start(0), window.begin)
+    ticks = np.logical_or(*saturated(setup, record.series))[before].sum()
+    contact = None if not part["prediction"] else {
+        "speed": part["prediction"][0]["approach"] / task.speed - 1,
+        "instant": window.begin - float(due),
+        "ratio": part["prediction"][0]["ratio"],
+        "jump": part["prediction"][0]["measured"] / task.speed,
+        "saturated": float(ticks * setup.scenario.control.period),
+    }  # fmt: skip
+    plan = (document["path"] or {}).get("strike")
+    why = "; ".join(dict.fromkeys(event["what"] for event in document["events"]))
+    return {"status": document["status"], "why": why, "plan": plan, "contact": contact}
+
+
+def results(case: str, name: str, seeds: range) -> list[dict[str, Any]]:
+    """Return the results of all seeds.  The spread does not affect the optimum, which is computed once."""
+    first: list[OfflinePosture] = []
+
+    def offline(*arguments: Any, **options: Any) -> OfflinePosture:
+        if not first:
+            first.append(offline_posture(*arguments, **options))
+        return first[0]
+
+    key = key_of(Job(case.split()[0], name, 0, compile="auto"))[:12]
+    files = {seed: FOLDER / f"{case.replace(' ', '-')}-{name}-{seed}-{key}.json" for seed in seeds}
+    return [kept(file, partial(struck, case, name, seed, offline)) for seed, file in files.items()]
+
+
+def lines(request: Request) -> Iterator[str]:
+    """Yield a table for each case."""
+    pairs = [(case, name) for case in CASES if request.only in case for name in CONTROLLERS]
+    seeds = range(1, request.count + 1)
+    answers = collected(lambda k: results(*pairs[k], seeds), len(pairs), request.jobs, "controllers")
+    answer_of = dict(zip(pairs, answers, strict=True))
+    yield (
+        f"Each number is the median over {len(seeds)} seeds, and in parentheses the worst. Bars: speed within "
+        f"{SPEED:.0%} of the stated one, instant within {1e3 * INSTANT:g} ms, no saturation before the contact, "
+        f"measured jump within {RATIO:.0%} of the predicted one, all runs completed. A seed changes the speed by "
+        f"at most {SPREAD.speed:.0%}, tilts the surface by at most {SPREAD.normal:g}°, and shifts it by at most "
+        f"{1e3 * SPREAD.gap:g} mm. The controllers do not know tilt and shift."
+    )
+    for case in dict.fromkeys(case for case, _ in pairs):
+        _, task = varied(case)
+        yield from ("", f"### {case.split()[0]}, {task.speed:g} m/s", "")
+        rows = {name: answer_of[case, name] for name in CONTROLLERS}
+        base = [run["contact"]["jump"] for run in rows["nominal"] if run["contact"]]
+        yield from table(HEAD, [_row(name, runs, base) for name, runs in rows.items()])
+        notes = [f"- `{name}`: {note}." for name, runs in rows.items() for note in _notes(runs)]
+        yield from ("", *notes) if notes else ()
+
+
+def _row(name: str, runs: list[dict[str, Any]], base: list[float]) -> list[str]:
+    contacts = [run["contact"] for run in runs if run["contact"]]
+    done = sum(run["status"] == "completed" for run in runs)
+    cells, missed = [f"`{name}`"], list[str]()
+    for key, unit, aim, bar, style in (
+        ("speed", 100, 0.0, SPEED, "+.1f"),
+        ("instant", 1e3, 0.0, INSTANT, "+.1f"),
+        ("saturated", 1e3, 0.0, SATURATED, ".0f"),
+        ("ratio", 1, 1.0, RATIO, ".2f"),
+    ):
+        values = [contact[key] for contact in contacts if contact[key] is not None]
+        worst = max(values, key=lambda value: abs(value - aim), default=None)
+        if worst is None or len(values) < len(runs) or abs(worst - aim) > bar:
+            missed.append(key)
+        cells.append("–" if worst is None else f"{unit * median(values):{style}} ({unit * worst:{style}})")
+    jumps = [contact["jump"] for contact in contacts]
+    cells.append(f"{mean(jumps) / mean(base):.2f}" if jumps and base else "–")
+    return [*cells, f"{done} of {len(runs)}", ", ".join([*missed, *["completed"] * (done < len(runs))]) or "none"]
+
+
+def _notes(runs: list[dict[str, Any]]) -> Iterator[str]:
+    """Yield why runs did not complete, and what the plan of the first run could not reach."""
+    for why in dict.fromkeys(run["why"] for run in runs if run["why"]):
+        yield f"{sum(run['why'] == why for run in runs)} of {len(runs)} runs: {why.rstrip('.')}"
+    plan = runs[0]["plan"]
+    if plan is not None:
+        stop = plan["follow_through"]
+        most = f", at most {plan['speed']:.2f} m/s, because of {plan['hindrance']}" if plan["hindrance"] else ""
+        why = f" ({stop['hindrance']})" if stop["hindrance"] else ""
+        length, stops = 1e3 * plan["run_up_m"], f"{stop['stopped']} of {stop['impacts']}"
+        yield f"planned run-up of {length:.0f} mm{most}; can stop after {stops} impacts{why}"
