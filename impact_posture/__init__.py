@@ -69,7 +69,8 @@ _HOMES = {
     "optimize": "api.posture_result",
 }
 
-__all__ = ["__version__", *_HOMES, *_MODULES]
+# ``from impact_posture import *`` does not hide the packages ``torch`` and ``jax``.
+__all__ = ["__version__", *_HOMES, *sorted({*_MODULES} - {"jax", "torch"})]
 
 
 def __getattr__(name: str) -> Any:
@@ -81,4 +82,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted(__all__)
+    return sorted({*__all__, *_MODULES})

@@ -38,9 +38,11 @@ def result() -> ip.PostureResult:
 
 
 def test_every_name_is_there() -> None:
-    assert dir(ip) == sorted(ip.__all__) and {"load_robot", "optimize", "PostureProblem", "tsid"} < set(dir(ip))
+    # A star import would hide the packages of these names.
+    assert {*dir(ip)} - {*ip.__all__} == {"jax", "torch"}
+    assert {"load_robot", "optimize", "PostureProblem", "tsid"} < {*ip.__all__}
     for package in (ip, ip.tsid):
-        assert all(getattr(package, name) is not None for name in package.__all__)
+        assert all(getattr(package, name) is not None for name in dir(package))
         with pytest.raises(AttributeError, match="nothing"):
             package.nothing  # noqa: B018
 
