@@ -46,7 +46,8 @@ Sign = Annotated[
     Literal["+1", "1", "-1"] | None, options.option("--sign", RUN, "Sign of the push.", show_default="both")
 ]
 ExportWorld = Annotated[
-    str | None, options.option("--export-world", RUN, "Only write the world for C++.", metavar="DIR")
+    str | None,
+    options.option("--export-world", RUN, "Write the world for C++ programs, and run nothing.", metavar="DIR"),
 ]
 Out = Annotated[
     str | None, options.out_option("Folder for run.json, the time series and the figures.", "./SCENARIO-CONTROLLER")

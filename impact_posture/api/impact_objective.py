@@ -52,11 +52,11 @@ class ImpactObjective(WorstCaseObjective):
             offset that robot.toml has for its frame.
         metric: Norm of the velocity jump: ``euclidean``, ``kinetic`` or ``weighted``, or a
             :class:`~impact_posture.impact.metric.Metric`.
-        kind: Minimized quantity: ``impulse`` (λ̄²H), ``speed`` (V), ``sticking`` (S), ``coulomb`` (C), ``energy``
-            (E) or ``effective-mass`` (m).  λ̄ is the largest impulse of the contact, and ``docs/notation.md`` defines
-            the other symbols.  ``None`` selects ``impulse``.  But if the contact states its friction, ``None``
-            selects the same quantity as ``--objective auto`` on the command line.  A :class:`PostureProblem` that
-            states the speed or the elasticity of the contact also does this.
+        kind: Minimized quantity: ``impulse`` (λ̄²H), ``speed`` (V), ``sticking`` (S), ``coulomb`` (C), ``energy`` (E)
+            or ``effective-mass`` (m).  λ̄ is the largest impulse of the contact, and ``docs/notation.md`` defines the
+            other symbols.  ``None`` selects ``impulse``.  But if the contact states its friction, ``None`` selects
+            the same quantity as ``--objective auto`` on the command line.  In a :class:`PostureProblem` that states
+            the speed or the elasticity of the contact, ``None`` does the same.
         supports: Feet that stay in place during the impact, as ``FRAME[:point|surface]``; ``None`` selects the feet
             of robot.toml, ``()`` selects no feet.
         compliance: Compliance ε of the supports, 1/kg; 0 selects 1e-4 divided by the mass of the robot.

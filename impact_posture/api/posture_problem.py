@@ -31,8 +31,8 @@ class PostureProblem:
 
     Args:
         objective: An :class:`ImpactObjective`, or another implementation of
-            :class:`~impact_posture.impact.objective.Objective`.  An objective without ``kind`` gets its kind as by
-            ``--objective auto`` on the command line, if speed, friction or elasticity of the contact are stated.
+            :class:`~impact_posture.impact.objective.Objective`.  If speed, friction or elasticity of the contact are
+            stated, an objective without ``kind`` gets the kind that ``--objective auto`` selects on the command line.
         posture: Start of the search: the name of a posture, a file, or a configuration of shape (nq,); ``None``
             selects the default posture.
         speed: Approach speed of the predicted impact, m/s.

@@ -39,7 +39,8 @@ class MeshCheck:
     """Collision check of the shapes of a robot, prepared for many postures.
 
     Overlaps of less than 1 µm are ignored.  Meshes are surfaces, so a mesh entirely inside another does not collide.
-    ``groups`` may contain the group number of each joint: held joints fix shapes of one group, which may touch.
+    ``groups`` may contain the group number of each joint.  Shapes of one group may touch, because held joints fix
+    them to each other.
     """
 
     def __init__(self, robot: Robot, shapes: RobotShapes, groups: Sequence[int] = ()) -> None:

@@ -65,7 +65,7 @@ MATERIALS = {"steel": (200e9, 0.28), "wood": (11.5e9, 0.3), "rubber": (0.03e9, 0
 CLEARANCE, PATCH = 0.001, 0.3
 # Default friction coefficient (Coulomb).
 FRICTION = Unstated(0.7)
-# Default number of starts of a multi-start search, and most random postures that the adaptive search screens.
+# Default number of starts of a multi-start search, and of random postures that the adaptive search screens at most.
 STARTS, SCREENED = 16, 6144
 # Number of bounds if --tradeoff is given without a number.
 TRADEOFF_POINTS = 16
@@ -75,7 +75,7 @@ SPEED, RESTITUTION = Unstated(1.0), 0.0
 
 @dataclass(frozen=True, kw_only=True)
 class LoadOptions(StrictTable):
-    """Options of loading a robot.  ``None`` selects the value of ``robot.toml``.
+    """Options for loading a robot.  ``None`` selects the value of ``robot.toml``.
 
     Attributes:
         lock: Joints that become rigid at the default posture: names, or patterns such as ``gripper_*``.
@@ -105,10 +105,14 @@ class LoadOptions(StrictTable):
         None, "File of data that a URDF cannot contain.", ROBOT, "ROBOT.TOML", "beside the URDF"
     )
     srdf: str | None = setting(
-        None, "Named postures and rotor data: a path, or example-robot-data:PATH.", ROBOT, "FILE", "from robot.toml"
+        None,
+        "SRDF with postures and rotor data: a path, or example-robot-data:PATH.",
+        ROBOT,
+        "FILE",
+        "from robot.toml",
     )
     package_dir: tuple[str, ...] = setting(
-        (), "Folder of package:// paths; repeatable.", ROBOT, "DIR", repeatable=True
+        (), "Folder in which package:// paths are searched; repeatable.", ROBOT, "DIR", repeatable=True
     )
     xacro_arg: Mapping[str, str] | None = setting(
         None, "Argument of a xacro file; repeatable.", ROBOT, "NAME:=VALUE", "the file's defaults",
@@ -280,7 +284,7 @@ class ProblemSettings(ImpactSettings):
         "adaptive", "adaptive; multistart; or global, which adds a map of one or two degrees of freedom.", SEARCH
     )
     starts: OneOrMore | None = setting(
-        None, "Most random postures that the search screens, or number of starts of multistart.", SEARCH,
+        None, "Largest number of screened random postures, or number of starts of multistart.", SEARCH,
         words=f"{SCREENED}, multistart {STARTS}",
     )  # fmt: skip
     finish_all: bool = setting(

@@ -1,4 +1,4 @@
-"""Batches of H and the objective on all CPU cores, or on a GPU if the arrays are there.  CasADi is not needed.
+"""Batches of H and the objective on all CPU cores, or on the GPU that holds the arrays.  CasADi is not needed.
 
 Arrays of every package with the DLPack protocol are accepted: NumPy, CuPy, PyTorch, JAX.  A GPU needs CuPy
 (``impact-posture[cuda]``) and an export with ``--cuda``.  CuPy compiles the kernels with NVRTC at their first call.

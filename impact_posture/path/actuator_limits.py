@@ -75,7 +75,7 @@ class ActuatorLimits:
         return None if self._out_of_reach(load) else self._equilibrium.shares(q, load)
 
     def need(self, moment: Moment, speeds: Array, part: float = 1.0) -> Need:
-        """Return the largest share of a limit in ``q``, ``ν``, ``ν̇``; infinite if rotors or friction do not allow it.
+        """Return the largest share of a limit at ``q``, ``ν``, ``ν̇``; infinite if rotors or friction forbid them.
 
         ``speeds`` are the velocity limits, shape (nv,).  Torques and thrusts may use only ``part`` of their ranges.
         """

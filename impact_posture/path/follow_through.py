@@ -1,4 +1,4 @@
-"""The motion after the impact of a strike: it brings the robot to rest, also from states beside the predicted one."""
+"""The motion after the impact of a strike: it brings the robot to rest from the predicted or a similar state."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from impact_posture.posture.program.certificate import linearized_limits
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem, equality_jacobian
 from impact_posture.system.arrays import Array
 
-# The states beside the predicted one: coefficients of restitution, and factors on the velocity before the impact.
+# The similar states: coefficients of restitution, and factors on the velocity before the impact.
 RESTITUTIONS, FACTORS = (0.0, 0.5), (0.8, 1.0, 1.2)
 # Number of normals on the edge of the cone.
 _EDGE = 4
@@ -35,7 +35,7 @@ _POSTURES = 12
 
 @dataclass(frozen=True)
 class Room:
-    """The least distance along stops: ``distance`` (rad or m), what is near, and after which impact."""
+    """The least distance along all stops, rad or m, with the joint or bodies (``of``) and the ``impact``."""
 
     distance: float
     of: str
@@ -44,7 +44,7 @@ class Room:
 
 @dataclass(frozen=True, eq=False)
 class FollowThrough:
-    """The stop after the predicted impact, and the room that stops after all considered impacts leave.
+    """The stop after the predicted impact, and the least distances along the stops after all considered impacts.
 
     Attributes:
         velocity: Predicted generalized velocity after the impact, ``ν + Δν``, shape (nv,).  It is ``ν`` if no impulse
@@ -57,7 +57,7 @@ class FollowThrough:
         longest_s: Duration of the longest of these stops, s.
         joints: Least distance from a joint limit; ``None`` without limits.
         clearance: Least distance between links and other bodies minus the clearance; ``None`` without shapes.
-        hindrance: What prevents a stop, and after which impact; empty if all exist.
+        hindrance: What prevents a stop, and after which impact; empty if all stops exist.
     """
 
     velocity: Array
@@ -97,7 +97,7 @@ def follow_through(
 ) -> FollowThrough:
     """Return the stop after the impact at ``q`` with the velocity ``ν``, shape (nv,), within the limits.
 
-    Joints that the problem holds, and feet, count as still.  The velocity after the impact may exceed the limits.
+    Held joints and feet are assumed not to move.  The velocity after the impact may exceed the limits.
     """
     spaces = StrikeSpaces(problem, q)
     around, cone, axes = {"": spaces}, np.deg2rad(problem.impact.normal_cone_deg), cone_axes(spaces.normal)

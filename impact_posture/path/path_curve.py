@@ -42,7 +42,7 @@ class PathCurve:
 
     ``s`` contains the values of the parameter at the postures, evenly spaced, shape (n,).  ``z`` contains the tangent
     coordinates of the postures at the first posture, shape (n, nv).  ``ends`` contains the velocity ``dq/ds`` at the
-    first and the last posture, shape (nv,) each; ``None`` leaves it to the spline.
+    first and the last posture, shape (nv,) each; with ``None``, the spline chooses this velocity.
     """
 
     def __init__(

@@ -196,7 +196,7 @@ def _struck(
     blocked = ""
     for k, run in sorted(runs, key=lambda each: -each[1].strike.speed):
         before, begin = run.spaces.approach, run.motion.rows.q[0]
-        # The surface at the optimum can be nearer than the contact point at the start, which then has to leave it.
+        # At the start, the contact point can be behind the surface at the optimum, and must then leave it.
         here = start if before.valid(start) else before.pulled(start)
         if here is None:
             blocked = blocked or _fault(before, start)

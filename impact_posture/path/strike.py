@@ -20,7 +20,7 @@ from impact_posture.posture.program.certificate import linearized_limits
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem
 from impact_posture.system.arrays import Array, null_space
 
-# Weight of the squared velocities, relative to their limits, beside the largest of them.
+# Weight of the squared velocities, relative to their limits, which are added to the largest relative velocity.
 _UNIQUE = 1e-4
 # An inequality or joint limit is active within this distance (m, rad, or the unit of the constraint).
 _ACTIVE = 1e-3
@@ -126,7 +126,7 @@ class RunUp:
 
     Attributes:
         motion: Motion from rest to the impact.
-        strike: The impact; its times count from the begin of the run-up.
+        strike: The impact; its times count from the beginning of the run-up.
         spaces: The constraints before and after the impact.
     """
 

@@ -34,7 +34,7 @@ _AT_REST = (CenterOfMassOverFeet, Holdable, ReachableWrench)
 class StrikeSpaces:
     """The constraints of a strike at a posture ``q``, shape (nq,), for the motions before and after the impact.
 
-    The surface stays where it is at ``q``.  The contact point may not enter it.
+    The surface stays where it is at ``q``.  The contact point must not enter the surface.
 
     Attributes:
         normal: Normal of the surface at ``q``, world axes, shape (3,).

@@ -15,15 +15,16 @@ from impact_posture.path.time_law import TimeLaw, polynomial, whole
 from impact_posture.path.timed_curve import moment
 from impact_posture.system.arrays import Array
 
-# Lengths of a stroke, as time at the velocity of the impact, s: the second one is used if the first one is too short.
+# Lengths of a stroke, s, measured as the time at the velocity of the impact.  The second length is used if the first
+# is too short.
 _SHORT, _LONG = 0.1, 0.5
 # Tangent length between two knots of a stroke, and largest tangent length, rad mixed with m.
 _KNOTS, _FARTHEST = STEP / 2, 1.5
-# Smallest tangent speed that counts, rad/s mixed with m/s.
+# Least tangent speed with which a curve is computed, rad/s mixed with m/s.
 _AT_REST = 1e-9
 # Least number of knots, and how often the length of a curve is halved until its knots suffice.
 _LEAST, _HALVINGS = 8, 3
-# A stroke ends where its velocity exceeds this multiple of the velocity at its posture.
+# A stroke ends where its velocity exceeds this multiple of ``u``, the velocity at the posture ``q``.
 _FASTER = 3.0
 # A stroke ends where inequalities or joint limits deflect a step by more than this share of its planned length.
 _DEFLECTED = 0.01
@@ -45,8 +46,8 @@ _RISING, _FALLING = np.array([-1.0, 2.0, 0.0, 0.0, 0.0]), np.array([1.0, -2.0, 0
 class Stroke:
     """A smooth curve on the constraints that passes a posture ``q`` with the velocity ``u``, before or after it.
 
-    The curve follows ``dq/db = u + A⁺(q)(A(q₀)u − A(q)u)`` from ``q₀ = q``, the velocity that is nearest to ``u``
-    and for which ``A(q)`` has the same product as at the start.  ``b`` is the time at this velocity, s.
+    The curve follows ``dq/db = u + A⁺(q)(A(q₀)u − A(q)u)`` from ``q₀ = q``.  This velocity is the nearest to ``u``
+    with ``A(q) dq/db = A(q₀)u``.  ``b`` is the time at this velocity, s.
 
     Args:
         space: Postures that the curve may pass.
@@ -151,7 +152,7 @@ class Stroke:
         return high
 
     def hindrance(self, limits: ActuatorLimits, factor: float) -> str:
-        """Return what prevents a motion with the velocity ``factor u``: the limit that it exceeds least, and why."""
+        """Return what prevents a motion with the velocity ``factor u``: the limit with the least excess, and why."""
         durations = np.geomspace(min(_SHORTEST[0], self.time / factor), 2 * self.time / factor, 12)
         least = min((self.need(limits, d, factor) for d in durations), key=lambda need: need.share)
         room = f", and the motion cannot be longer because of {self.end}" if self.end else ""

@@ -27,7 +27,7 @@ class TimeLaw:
     Attributes:
         progress: Polynomials of ``s`` over time.
         duration: Duration, s.
-        bends: Times at which ``s̈`` begins or ends to change, s.
+        bends: Times at which ``s̈`` starts or stops changing, s.
     """
 
     progress: PPoly

@@ -55,8 +55,8 @@ def urdf_couplings(root: ET.Element, where: str) -> tuple[tuple[JointCoupling, .
     """Return the couplings that the ``<mimic>`` tags of a URDF state, and warnings about tags that state none.
 
     The tags of coupled joints in ``root`` change.  Continuous joints become revolute joints without limits, because a
-    follower depends on the whole angle, not only on its cosine and sine.  The limits of a joint become equal if it
-    mimics a fixed joint, or with the multiplier zero.
+    cosine and a sine do not count the full turns of a leader.  The limits of a joint become equal if it mimics a
+    fixed joint, or with the multiplier zero.
 
     Raises:
         UrdfError: Joints mimic each other in a circle, a planar or floating joint is coupled, or a number is invalid.

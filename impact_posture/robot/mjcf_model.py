@@ -29,7 +29,7 @@ def model_of(mjcf: Any, couplings: Sequence[JointCoupling]) -> pin.Model:
 
     A body with several joints becomes a chain of joints, in which only the last joint carries the inertia.
     """
-    # A coupled joint depends on the whole angle, not only on its cosine and sine.
+    # The coordinate of a coupled joint is the angle itself, because a cosine and a sine do not count full turns.
     whole = {joint for c in couplings for joint in (c.follower, c.leader)}
     types = import_mujoco().mjtJoint
     model = pin.Model()

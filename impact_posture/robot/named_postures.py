@@ -62,7 +62,7 @@ def ignored_bases(spec: RobotSpec, srdf: Path | None, default: str) -> tuple[str
 
 
 def _neutral(described: RobotDescription) -> Array:
-    """Return the neutral configuration of a file; joints beyond a limit are at this limit."""
+    """Return the neutral configuration of a file; a value beyond a limit is replaced by this limit."""
     model = described.model
     return np.asarray(np.clip(described.neutral, model.lowerPositionLimit, model.upperPositionLimit))
 

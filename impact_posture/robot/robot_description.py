@@ -21,7 +21,8 @@ class RobotDescription(NamedTuple):
 
     Attributes:
         model: Model with all joints.
-        neutral: Configuration from which named postures start: zero for a URDF, ``qpos0`` for an MJCF, shape (nq,).
+        neutral: Values of the joints that a named posture leaves out: zero for a URDF, ``qpos0`` for an MJCF, shape
+            (nq,).
         postures: Name of a keyframe → configuration, shape (nq,).
         couplings: Couplings of joints.
         warnings: Warnings, one line each.

@@ -162,8 +162,8 @@ def before(series: Series, window: Window) -> int:
 def impact_load(setup: Setup, series: Series, window: Window) -> ImpactLoad:
     """Return the effects on base, joints and contact within :data:`JUMP` after the start of an impact window.
 
-    The jump is the largest ``‖ν(t) − ν⁻‖``.  For pushes, it is the largest ``‖ν‖`` in the window.  Likewise, the base
-    and each joint have their largest changes.  The peak force is the largest in the window.
+    The jump is the largest ``‖ν(t) − ν⁻‖``.  For pushes, it is the largest ``‖ν‖`` in the window.  The changes of
+    base and joints are also the largest within this time.  The peak force is the largest in the window.
     """
     end, inside = window.end if setup.scenario.push else window.begin + JUMP, series.slice(window.begin, window.end)
     ticks, k = series.slice(window.begin, end), before(series, window)

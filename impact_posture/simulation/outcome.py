@@ -212,7 +212,7 @@ def _contacts(setup: Setup, run: Run) -> list[Event]:
 
 
 def _longest(flags: Flags) -> tuple[int, int]:
-    """Return the begin and the length of the longest sequence of true flags."""
+    """Return the first index and the length of the longest sequence of true flags."""
     sequences = [ticks for (ticks,) in ndimage.find_objects(ndimage.label(flags)[0])]
     longest = max(sequences, key=lambda ticks: ticks.stop - ticks.start, default=slice(0, 0))
     return longest.start, longest.stop - longest.start

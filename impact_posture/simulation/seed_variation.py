@@ -78,7 +78,7 @@ def _scaled(scenario: Scenario, speed: float, friction: float) -> Scenario:
 
 
 def _start(setup: Setup, size: float, generator: np.random.Generator) -> Array:
-    """Return a random start near ``setup.q``.  The base of a flying robot stays, and the feet of a standing robot."""
+    """Return a random start near ``setup.q``; the base of a flying robot or the feet of a standing robot stay."""
     robot, model = setup.robot, setup.robot.model
     for _ in range(_DRAWS):
         step = size * generator.uniform(-1, 1, robot.nv)

@@ -145,7 +145,7 @@ class Controller:
         """Start again at ``(q, ν)``: set task targets that are not set yet, and clear ramps and warm starts.
 
         Returns:
-            The first command.  If the first tick fails, the tick returns this command with damping.
+            The first command.  If the first tick fails, it repeats this command with additional damping.
 
         Raises:
             PostureError: ``q`` is not a configuration, ``v`` is not a velocity, or an entry is too large.

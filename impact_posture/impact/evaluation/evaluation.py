@@ -59,7 +59,7 @@ class Evaluation(JsonBlock):
             contact.  ``None`` if it does not exist at ``q``.
         gradient: Tangent gradient of H, shape (nv,).  The entries of a leader also count the motion of its followers,
             whose entries are zero.
-        objective_gradient: Likewise of the objective; ``None`` if it does not exist at ``q``.
+        objective_gradient: Tangent gradient of the objective, shape (nv,); ``None`` if it does not exist at ``q``.
         normal: Unit normal for which H, G, V, S, E and the jumps are computed, world axes, shape (3,).
         worst_normal: Unit normal for which the objective is computed, world axes, shape (3,).  With a cone of
             normals, the worst normal of the cone; otherwise equal to ``normal``.
@@ -85,8 +85,8 @@ class Evaluation(JsonBlock):
         compliance_effect: Relative change of H if the supports have a tenth of the compliance; ``None`` for a robot
             without supports.
         contact_stability: Whether the feet stay on the ground in the impact; ``None`` for a robot without supports.
-        standing: The impact if the ground can only push the feet; ``None`` for a robot without supports, or without
-            such an impact.
+        standing: The impact if the ground can only push the feet; ``None`` for a robot without supports, or if this
+            impact cannot be computed.
         contacts: Separate evaluation of each contact, the leading contact first; empty if there is only one contact.
         impulses: Worst impulses of several contacts; ``None`` if there is only one contact.
         model_variants: Objective and scalars for each model variant; empty if there are no variants.

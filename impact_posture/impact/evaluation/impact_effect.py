@@ -33,7 +33,7 @@ class WorstJoint(JsonBlock):
 
 @dataclass(frozen=True)
 class ImpactEffect(JsonBlock):
-    """Base and worst joint of a velocity jump.
+    """Effect of a velocity jump on the base and on the worst joint.
 
     Attributes:
         base_linear: Size of the linear velocity jump of a floating base, m/s; ``None`` for a fixed base.
@@ -96,7 +96,7 @@ def _worst_joint(robot: Robot, sizes: Array) -> WorstJoint | None:
 
 
 def mean_load(loads: Sequence[ImpactLoad]) -> ImpactLoad:
-    """Return base, impulse and jump averaged over one or more impacts, and the worst joint and peak force of any."""
+    """Return the means of base, impulse and jump over all impacts, the worst joint and the largest peak force."""
 
     def mean(values: Sequence[float | None]) -> float | None:
         known = [value for value in values if value is not None]

@@ -19,7 +19,7 @@ _SINGULAR, _RANK = 0.05, 1e-9
 
 @dataclass(frozen=True)
 class JointYield(JsonBlock):
-    """Speed of the contact for a joint velocity of norm 1; the feet do not move, the base only as the joints require.
+    """Speed of the contact for a joint velocity of norm 1; feet are fixed, and the base moves as the joints require.
 
     Attributes:
         along: Largest speed of the contact along the normal, m/rad: the singular value of ``nᵀJ`` of the joints.

@@ -43,8 +43,8 @@ class CoulombImpact:
         slip: Velocity of the contact point after the impact, world axes, shape (3,); zero if the point sticks.
         sigma: Multiplier ``σ``, 1/kg; zero if the point sticks, infinite if there is no friction.
         mass: Effective mass with friction, ``m = nᵀp``, kg: the normal impulse per approach speed.  Without friction,
-            ``m = 1/G``.  A frictionless impact of this mass compresses a spring along the normal equally, because the
-            impulse has a constant direction.
+            ``m = 1/G``.  A frictionless impact of this mass compresses a spring along the normal by the same amount,
+            because the impulse has a constant direction.
     """
 
     sticks: bool

@@ -8,7 +8,7 @@ surface:
     ``M Δν = Jᵀp + J_sᵀ(P − fT)``.
 
 :mod:`~impact_posture.impact.friction.contact_impulses` states the conditions for ``p`` and ``P``.  The forces ``f``
-are computed for locked joints: they are the forces on a statue that stands on the same feet.
+are computed for a robot with locked joints that stands on the same feet.
 
 The force of a linear contact is a quarter of a sine wave, and it is largest at T.  The impact is therefore solved in
 steps, in which the approach speed falls as ``v cos(πt/2T)``.
@@ -33,9 +33,9 @@ from impact_posture.system.arrays import Array
 _MOVES = 0.01
 # Number of steps of an impact in which the weight is counted.
 _STEPS = 8
-# The contact time from which on the feet stay is not resolved below this share of its largest value.
+# Resolution of the shortest contact time at which the feet stay, as a share of the largest time.
 _SHORTEST = 1e-4
-# A statue stands if its feet balance the weight up to this share.
+# A robot with locked joints stands if its feet balance the weight up to this share.
 _STANDS = 1e-6
 
 
@@ -89,7 +89,7 @@ class StandingFeet:
         return np.asarray(self._oracle.robot.projector @ np.linalg.solve(self.M, J.T))
 
     def _carried(self) -> Array | None:
-        """Return the forces under the weight if the robot is a rigid body: they stop its fall of one second."""
+        """Return the forces on the feet under the weight; they stop a rigid robot that has fallen for one second."""
         model, base = self._oracle.robot.model, self.jacobian[:, :6]
         fall = np.tile(np.array(model.gravity.linear), (len(self.frames), 1))
         B = base @ np.linalg.solve(self._oracle.numeric.mass_matrix()[:6, :6], base.T)

@@ -215,7 +215,7 @@ def _moves(view: ResultView, document: dict[str, Any]) -> str:
     if view.motion is not None and len(view.motion.t) > 1:
         end = "the optimum" if document["path"]["found"] else "the best posture that was reached"
         if view.motion.strike is not None:
-            end += f", which it strikes at {view.motion.strike.contact_s:.3g} s, and the stop after the impact"
+            end += f", the impact at {view.motion.strike.contact_s:.3g} s, and the stop after the impact"
         return f"The slider follows the motion of --path from the initial posture to {end}, over time. {arrows}."
     return (
         "The slider follows the straight line between the two postures, each point pulled onto the constraints. "

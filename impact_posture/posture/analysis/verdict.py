@@ -29,7 +29,7 @@ class Verdict(JsonBlock):
     """Changes from the initial to the optimal posture, at the given approach speed and friction.
 
     Attributes:
-        outcome: Verdict in a few words: ``better`` (nothing that base, joints or contact feel grows by 5 % or more),
+        outcome: Verdict in a few words: ``better`` (no effect on base, joints or contact grows by 5 % or more),
             ``better for … at the price of …``, ``no better``, ``worse``, ``cannot arrive`` or ``unknown``.
         line: The conditions, the outcome and the numbers in words.
         minimized: Name of the minimized objective, and change of the norm of the jump, in words.
@@ -39,8 +39,8 @@ class Verdict(JsonBlock):
         advice: Advice, one line each: the jump without friction, a better objective, or a more accurate joint model.
         conditions: Conditions under which the numbers hold, the gravest first.
         before, after: The predicted impact in the initial and in the optimal posture; ``None`` if it is unknown.
-        unilateral: The same predictions if feet can lift and slide; ``None`` if base and joints feel what feet that
-            stay predict.
+        unilateral: The same predictions if feet can lift and slide; ``None`` if the effects on base and joints are
+            the same as with feet that stay.
         assumptions: Assumptions behind the numbers, one line each.
     """
 
@@ -125,7 +125,7 @@ def _sentence(outcome: str, refuted: bool, later: bool) -> str:
 def _unilateral(
     impact: ResolvedImpact, evaluations: tuple[Evaluation, Evaluation], held: tuple[PredictedImpact, PredictedImpact]
 ) -> tuple[PredictedImpact, PredictedImpact] | None:
-    """Return the predictions for feet that lift or slide; ``None`` if base and joints feel what held feet predict."""
+    """Return the predictions for feet that lift or slide; ``None`` if the effects are the same as with held feet."""
     first, last = (evaluation.standing for evaluation in evaluations)
     if first is None or last is None:
         return None

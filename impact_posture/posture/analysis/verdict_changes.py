@@ -34,7 +34,7 @@ class Change:
     """Change of one quantity of the impact: a velocity jump, an impulse or a force.
 
     Attributes:
-        side: Part to which the quantity belongs.
+        side: The effect to which the quantity belongs: on the base, on the joints, impulse or force.
         relative: Relative change.
         line: The change in words.
         felt: Whether the change is not negligible compared with the approach speed.

@@ -14,8 +14,8 @@ from impact_posture.impact.resolved_impact import ResolvedImpact
 # If the attainable speed is below the approach speed by less than this fraction, it is treated as sufficient, because
 # the verdict shows only three digits of both speeds.
 _REACHED = 5e-3
-# The posture changes during the contact, and the prediction neglects it.  The change is proportional to the travel of
-# the surface in the compression time, m.  Up to this travel, jumps in `make study-verdict` are within 5 % of the
+# The prediction neglects the change of posture during the contact.  The change is proportional to the travel of the
+# surface in the compression time, m.  Up to this travel, jumps in `make study-verdict` are within 5 % of the
 # simulation or 1 % of the approach speed.
 LONG_TRAVEL = 0.015
 # A distance (rad, m) up to this value is a rounding error.

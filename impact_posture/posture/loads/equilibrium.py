@@ -1,4 +1,4 @@
-"""Forces that hold a robot at rest, and for which the largest share that an actuator uses of its range is least."""
+"""Forces that hold a robot at rest and minimize the largest share of its range that an actuator uses."""
 
 from __future__ import annotations
 

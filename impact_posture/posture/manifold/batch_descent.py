@@ -132,7 +132,8 @@ class BatchDescent:
         along = length[:, None] * s.direction
         point = self._points(np.clip(manifold.move(s.x, along + s.back), manifold.lower, manifold.upper))
         bound = s.merit + _SUFFICIENT * length * (s.direction * s.gradient).sum(axis=1)
-        # If the residual is too large for the first-order estimate, a step may raise the merit to reduce it.
+        # If the residual is too large for the first-order estimate, a step that halves the residual may raise the
+        # merit.
         returned = (s.residual > _NEAR) & (point.residual < s.residual / 2)
         accepted = np.isfinite(point.merit) & (point.residual <= _DRIFT) & ((point.merit <= bound) | returned)
         grown = np.where(length < 1, np.minimum(2 * s.radius, _LONGEST), s.radius)

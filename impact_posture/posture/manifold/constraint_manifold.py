@@ -148,7 +148,7 @@ class ConstraintManifold:
     def draw(self, rng: np.random.Generator, count: int, near: Array) -> Array:
         """Draw postures, shape (N, nx), a quarter of them near the posture ``near``, shape (nq,).
 
-        The others lie anywhere within the limits.  All may violate the constraints.
+        The others lie anywhere within the limits.  All these postures may violate the constraints.
         """
         ranges, base = draw_ranges(self.problem, self.chart), self.problem.robot.first_joint
         x = np.tile(self.chart.to_x(self.problem.given), (count, 1))

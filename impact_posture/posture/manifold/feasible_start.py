@@ -135,8 +135,8 @@ class Projector:
 def feasible_start(problem: ConstrainedProblem, index: int, seed: int, candidates: int = CANDIDATES) -> Array | None:
     """Return the ``index``-th feasible start of a seed, or ``None`` if no attempt reached the constraints.
 
-    Start 0 is the given posture, projected onto the constraints.  Another start is the one of ``candidates`` postures
-    (:class:`StartDraw`) that violates the other constraints least.
+    Start 0 is the given posture, projected onto the constraints.  For any other start, ``candidates`` postures are
+    projected (:class:`StartDraw`), and the posture that violates the remaining constraints least is returned.
     """
     if index == 0:
         projection = Projector(problem).project(problem.given)

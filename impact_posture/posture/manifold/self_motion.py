@@ -34,10 +34,10 @@ _NODES = 20_000
 # For surfaces: length of a step, least distance between nodes as a share of the step, and number of directions of
 # steps.
 _STEP, _APART, _DIRECTIONS = 0.16, 0.7, 8
-# Radius that a node of a surface covers, as a share of the step.  Consider a point one step away from a node.
-# Seen from the node, the nearest tried point is at most half the angle between directions away, and this angle
-# determines its distance from the point.  Some node is closer to the tried point than the least distance between
-# nodes.  The radius is the sum of both distances.
+# Radius that a node of a surface covers, as a share of the step.  Consider a point one step away from a node.  The
+# direction of the nearest tried point differs by at most half the angle between tried directions, which bounds the
+# distance to this tried point.  A node lies within the least distance between nodes of the tried point.  The radius
+# is the sum of both distances.
 COVERED = _APART + 2 * np.sin(np.pi / _DIRECTIONS / 2)
 _BATCH = 100
 

@@ -22,7 +22,7 @@ from impact_posture.system.arrays import Array
 # Penalty per meter of :attr:`LiftedRows.slack`, in units of the initial objective.  It must exceed the decrease of
 # the objective per meter of slack.  With a penalty of 2, the solutions still had slack.
 SLACK_PRICE = 50.0
-# Counter for the numbers of the programs in this process.
+# Counter for the identifiers of the programs in this process.
 _NUMBERS = count()
 
 
@@ -77,7 +77,7 @@ class PostureNLP:
         build_time_s: Time to build and compile the program.
         compiled: Whether the functions of the solver run as machine code.
         compiler_fault: Reason why a compilation failed; empty if no compilation failed.
-        number: Number of the program; it stays the same when only the target changes.
+        number: Identifier of the program; a program for another target keeps this identifier.
     """
 
     problem: ConstrainedProblem

@@ -60,8 +60,9 @@ class SolverRun:
         certificate: Certificate of the final posture; ``None`` while the program lacks parts.
         lacks: Whether the program lacks parts that the final posture needs.
         dominated: Whether the start was stopped after this run because it could not become the best.
-        trapped: Whether the final posture violates a constraint although no parts are missing, or because slack
-            lowers the objective by more than its price.  A trapped run is repeated at a higher price of slack.
+        trapped: Whether the final posture violates a constraint that more parts cannot repair: no parts are missing,
+            or slack lowers the objective by more than its price.  A trapped run is repeated at a higher price of
+            slack.
         time_s: Wall time of all runs from the start, s; the time of a run for several starts is divided equally among
             them.
     """
@@ -127,7 +128,7 @@ class GrowingSearch:
         self.build_time_s = self.nlp.build_time_s
         # Final postures of runs; the next runs continue from these postures with the extended program.
         self._ends: dict[int, Array] = {}
-        # Price of a meter of slack for starts without a run that ended in a trap.
+        # Price of a meter of slack for starts whose runs have not ended in a trap.
         self._price = SLACK_PRICE
         # For each start, the number of runs that ended in a trap (:attr:`SolverRun.trapped`).
         self._trapped: Counter[int] = Counter()

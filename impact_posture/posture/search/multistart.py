@@ -175,7 +175,7 @@ def solve(
     if screening is None:
         relative = np.array([o.objective for o in optima]) / max(abs(optima[0].objective), 1e-300)
         values = hits_by_value(relative, [o.hits for o in optima])
-        # Where starts would have led that could not become the best is unknown.
+        # It is unknown where the dominated starts would have ended.
         values += (1,) * dominated
         estimate = SearchEstimate.of("multistart", values, hits_of_best(optima), bound=dominated > 0)
     else:
@@ -210,7 +210,7 @@ def solve(
 
 
 def _without_collisions(problem: ConstrainedProblem, runs: list[SolverRun]) -> tuple[list[SolverRun], str]:
-    """Return the runs whose final postures have no collision, and the names of two shapes that collide in another."""
+    """Return the runs without a collision at the end, and the names of two shapes that collide in another run."""
     if problem.surroundings is None:
         return runs, ""
     good: list[SolverRun] = []
@@ -285,7 +285,7 @@ def _failure(problem: ConstrainedProblem, runs: list[SolverRun]) -> SolverFailed
     nearest = min((certificate for _, certificate in solved), key=lambda c: c.stationarity)
     fault = f"none of {len(solved)} feasible starts ended at a certified posture"
     hint = "try more `starts`, another `seed` or `posture`, or a small `regularization`"
-    # A posture that violates the constraints may be less singular than all that satisfy them.
+    # A posture that violates the constraints may be less singular than all postures that satisfy them.
     held = [record.q for record, certificate in solved if certificate.primal <= FEASIBLE]
     singular = singular_target(problem, [*held, *(run.start for run in runs if run.start is not None)])
     if singular is not None:

@@ -1,10 +1,11 @@
 """Screen many random postures by batch descents, hop from good ends, and choose the starts of IPOPT.
 
-The objective at a posture hardly predicts the optimum below it, so each posture descends first
-(:mod:`impact_posture.posture.manifold.batch_descent`).  A hop gives other values to some joints of a good end and
-descends from there (D. J. Wales and J. P. K. Doye, "Global optimization by basin-hopping", J. Phys. Chem. A 1997),
-because many optima differ in a few joints only.  Hops from the best end alone seldom leave it.  The hops that reach a
-better optimum often start from worse ends.  All limits are counts, so a seed determines the result.
+The objective at a posture hardly predicts the optimum to which a descent leads, so each posture descends first
+(:mod:`impact_posture.posture.manifold.batch_descent`).  A hop takes the end of a good descent, gives other values to
+some of its joints, and descends again (D. J. Wales and J. P. K. Doye, "Global optimization by basin-hopping", J.
+Phys. Chem. A 1997), because many optima differ in a few joints only.  Hops from the best end alone seldom leave it.
+The hops that reach a better optimum often start from worse ends.  All limits are counts, so a seed determines the
+result.
 """
 
 from __future__ import annotations
@@ -24,14 +25,15 @@ from impact_posture.posture.search.start_draws import StartDraws
 from impact_posture.posture.search.unseen_optima import SAME_VALUE, hits_by_value
 from impact_posture.system.arrays import Array
 
-# Number of descents under way.  New descents begin when a quarter of them has ended.  When no more may begin, the
-# search does not wait for this share, because a small batch takes nearly as long as a large one.
+# Number of descents under way.  New descents begin when a quarter of them has ended.  When no more descents may
+# begin, the search does not wait for this share, because a small batch takes nearly as long as a large one.
 _WIDTH, _SLOWEST = 512, 1 / 16
 # The number of descents, times the fourth power of the degrees of freedom, is limited by the first number, because
 # descents of large robots take longer.  At least the second number is allowed.
 _WORK, _LEAST = 40_000_000, 16
-# If less than the first share of the first random postures reach the equalities, their ends differ too little.  Then
-# this number of starts that satisfy all constraints descend too; the number is at most the second share of the limit.
+# If less than the share ``_REACHED`` of the first random postures reaches the equalities, their ends differ too
+# little.  Then ``_FEASIBLE`` starts that satisfy all constraints descend too, but at most the share ``_PART`` of the
+# limit.
 _REACHED, _FEASIBLE, _PART = 0.4, 128, 1 / 8
 # Share of the new descents that are hops.
 _HOPPING = 0.75
@@ -45,8 +47,8 @@ _REDRAWN, _CROSSED = (0.1, 0.2, 0.3, 0.5), 0.6
 _SAME = 0.05
 # The search stops if random postures and hops from worse ends reached the best merit often enough, at least ``_ENDS``
 # descents have ended, and the last ends, a share ``_IDLE`` of all, did not lower the best merit.  ``_HITS`` times are
-# enough if the equalities leave at most ``_FREE`` degrees of freedom.  Each further one doubles the times, because
-# the number of optima grows exponentially with the degrees of freedom.
+# enough if the equalities leave at most ``_FREE`` degrees of freedom.  Each further degree doubles this number,
+# because the number of optima grows exponentially with the degrees of freedom.
 _HITS, _FREE, _ENDS, _IDLE = 12, 5, 256, 0.5
 # Number of starts of IPOPT, half of them at the best ends and half at the most different good ends.  If descents
 # ignored no constraint, a third suffices.  The number, times the degrees of freedom, is limited by the second
@@ -167,7 +169,7 @@ class _Search:
             projection = projector.project(self._manifold.to_q(self.ends.x[self._end[k]]))
             if projection.violation <= FEASIBLE:
                 guesses[k] = projection.q
-        # Where stuck descents would have led is unknown.
+        # It is unknown where the stuck descents would have ended.
         stuck = (1,) * int((self.descent.stuck == _RANDOM).sum())
         values = hits_by_value(self.ends.merit, self.ends.tag == _RANDOM) + stuck
         return Screening(

@@ -1,4 +1,4 @@
-"""Poses that are held where the robot is singular, for example with a stretched arm, and a bent start instead."""
+"""Detect held poses at which the robot is singular, for example with a stretched arm, and offer a bent start."""
 
 from __future__ import annotations
 

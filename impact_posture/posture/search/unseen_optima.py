@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 
 from impact_posture.config.json_block import JsonBlock
 
-# If no start was alone at its optimum, at most this number of starts in N lead elsewhere, with a confidence of 95 %
-# (rule of three).
+# If several of N starts reached each optimum, at most this number in N of further starts leads to another optimum,
+# with a confidence of 95 % (rule of three).
 _RULE_OF_THREE = 3
 # Difference of two objectives, divided by the objective, up to which they count as one.
 SAME_VALUE = 5e-3

@@ -21,17 +21,18 @@ from impact_posture.tsid.tasks.joint_posture import JointPosture
 class StrikeDriver(ImpactFeedbackDriver):
     """Nominal controller whose references follow a path that strikes (:mod:`impact_posture.path.strike`).
 
-    After :meth:`brace`, the robot moves to the begin of the run-up.  The run-up ends at the expected time of the
+    After :meth:`brace`, the robot moves to the beginning of the run-up.  The run-up ends at the expected time of the
     impact.  If there is no contact yet, the references continue at the velocity of the impact.  The contact is felt
     by the force sensor, or because the contact point has less than half of its planned speed.  At the contact, or
     :attr:`LATE` after the expected time, the references switch to the stop after the impact.  When the end effector
-    has to return, the robot moves back to the begin of the run-up.
+    has to return, the robot moves back to the beginning of the run-up.
 
     Attributes:
         path: Path with a strike.
     """
 
-    # Longest time for which the references continue into the surface, s, and the share of the speed without contact.
+    # Longest time for which the references continue into the surface, s, and the share of the planned speed below
+    # which the point has touched the surface.
     LATE, STOPPED = 0.05, 0.5
 
     def __init__(self, setup: Setup, posture: JointPosture, path: PosturePath) -> None:
@@ -43,10 +44,10 @@ class StrikeDriver(ImpactFeedbackDriver):
         self._begin()
 
     def _begin(self) -> None:
-        # Motion to the begin of the run-up, its first and last time in this motion, and the time when it began.
+        # Motion to the beginning of the run-up, its first and last time in this motion, and the time when it began.
         self._way: RowInterpolation = self.path
         self._until, self._left = self._strike.run_up_s, np.inf
-        # Time of the contact, and the displacement of the robot from its planned posture then.
+        # Time of the contact, and the displacement of the robot from its planned posture at this time.
         self._hit, self._shift = np.inf, np.zeros(self.setup.robot.nv)
         self._now, self._moment = 0.0, self.path.at(0.0)
 
@@ -89,7 +90,7 @@ class StrikeDriver(ImpactFeedbackDriver):
             task.target_velocity, task.target_acceleration = J @ v, J @ a + task.drift(state)
 
     def _retreat(self) -> None:
-        """Begin a motion from the last stop to the begin of the run-up, within :data:`MOVE`."""
+        """Begin a motion from the last stop to the beginning of the run-up, within :data:`MOVE`."""
         zero = np.zeros((2, self.setup.robot.nv))
         ends = np.array([self._moment[0], self.path.at(self._strike.run_up_s)[0]])
         self._way = RowInterpolation(self.setup.robot.model, np.array([0.0, MOVE]), ends, zero, zero)
