@@ -174,8 +174,8 @@ class PostureResult:
 
         Args:
             seed: Seed of the sampling planner.
-            strike: Whether the contact point arrives at the optimum with the approach speed of the problem, after a
-                run-up along the normal (:mod:`~impact_posture.path.strike`), instead of at rest.
+            strike: Whether the path ends with an impact instead of at rest (:mod:`~impact_posture.path.strike`).  The
+                contact point then arrives with the approach speed of the problem, after a run-up along the normal.
 
         Raises:
             InputError: The package TOPP-RA (``impact-posture[path]``) is not installed, or the contact cannot strike.

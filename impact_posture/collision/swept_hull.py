@@ -123,7 +123,7 @@ def _measure(a: Any, at_a: pin.SE3, b: Any, at_b: pin.SE3) -> tuple[float, Any]:
     result = coal.DistanceResult()
     distance = coal.distance(a, transform(at_a), b, transform(at_b), _REQUEST, result)
     if not np.isfinite(result.normal).all():
-        # If two corners coincide, coal computes no normal.  A shift by a nanometer avoids this.
+        # If two corners coincide, coal computes no normal.  A shift by a nanometer separates the corners.
         at_a.translation = at_a.translation + np.array([0.6, 0.64, 0.48]) * 1e-9
         result = coal.DistanceResult()
         distance = coal.distance(a, transform(at_a), b, transform(at_b), _REQUEST, result)

@@ -262,8 +262,8 @@ class CompiledController:
                 before the impact.
 
         Raises:
-            InputError: This phase cannot follow the present phase, or ``t`` is before the time of a waiting phase, or
-                ``t_impact`` is not finite, or ``t_impact`` is given to a controller without a flow.
+            InputError: This phase cannot follow the present phase, ``t`` is before the time of a waiting phase,
+                ``t_impact`` is not finite, or a controller without a flow gets ``t_impact``.
         """
         if t_impact is None:
             self._enter("brace", t)

@@ -50,9 +50,9 @@ class FollowThrough:
         velocity: Predicted generalized velocity after the impact, ``ν + Δν``, shape (nv,).  It is ``ν`` if no impulse
             is known.
         rows: The motion from this velocity to rest; ``None`` if it does not exist.
-        impacts: Number of impacts: the predicted one, and each restitution in :data:`RESTITUTIONS` with each factor
-            in :data:`FACTORS` on the velocity before the impact, for the normal and for normals on the edge of the
-            cone of normals.
+        impacts: Number of considered impacts: the predicted impact, and all combinations of a restitution in
+            :data:`RESTITUTIONS`, a factor on the velocity in :data:`FACTORS`, and a normal (also on the edge of the
+            cone of normals).
         stopped: Number of these impacts after which a stop within the limits exists.
         longest_s: Duration of the longest of these stops, s.
         joints: Least distance from a joint limit; ``None`` without limits.

@@ -40,7 +40,7 @@ class _Silhouette(PathPatch):
     """Patch in picture coordinates.  3-D axes draw it behind everything else."""
 
     def do_3d_projection(self) -> float:
-        """Return an infinite depth: 3-D axes draw the deepest patch first, so the others cover this one."""
+        """Return an infinite depth: 3-D axes draw the deepest patch first, so all other patches cover this patch."""
         return float("inf")
 
 

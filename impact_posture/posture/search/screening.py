@@ -40,15 +40,15 @@ _HOPPING = 0.75
 # A hop starts at an optimum with a probability proportional to ``(1 + rank)^-_RANKED / (1 + hops / _TIRED)²``.  The
 # best optimum has the rank 0, and ``hops`` counts the earlier hops from this optimum.
 _RANKED, _TIRED = 0.7, 8
-# Shares of the joints to which a hop gives other values, rounded up, and the share of hops that take the values from
-# another optimum instead of random ones.
+# A hop gives other values to one of these shares of the joints, rounded up.  The second number is the share of hops
+# that take these values from another optimum; the other hops draw random values.
 _REDRAWN, _CROSSED = (0.1, 0.2, 0.3, 0.5), 0.6
 # Distance (rad, m) below which two ends are the same optimum if their merits differ by less than SAME_VALUE.
 _SAME = 0.05
-# The search stops if random postures and hops from worse ends reached the best merit often enough, at least ``_ENDS``
-# descents have ended, and the last ends, a share ``_IDLE`` of all, did not lower the best merit.  ``_HITS`` times are
-# enough if the equalities leave at most ``_FREE`` degrees of freedom.  Each further degree doubles this number,
-# because the number of optima grows exponentially with the degrees of freedom.
+# The search stops under three conditions.  Random postures and hops from worse ends reached the best merit often
+# enough.  At least ``_ENDS`` descents have ended.  The last share ``_IDLE`` of all ends did not lower the best merit.
+# ``_HITS`` times are enough if the equalities leave at most ``_FREE`` degrees of freedom.  Each further degree
+# doubles this number, because the number of optima grows exponentially with the degrees of freedom.
 _HITS, _FREE, _ENDS, _IDLE = 12, 5, 256, 0.5
 # Number of starts of IPOPT, half of them at the best ends and half at the most different good ends.  If descents
 # ignored no constraint, a third suffices.  The number, times the degrees of freedom, is limited by the second

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 
 from impact_posture.config.json_block import JsonBlock
 
-# If several of N starts reached each optimum, at most this number in N of further starts leads to another optimum,
-# with a confidence of 95 % (rule of three).
+# Rule of three: if N starts reached each optimum at least twice, at most the share ``_RULE_OF_THREE / N`` of further
+# starts leads to a new optimum, with a confidence of 95 %.
 _RULE_OF_THREE = 3
 # Difference of two objectives, divided by the objective, up to which they count as one.
 SAME_VALUE = 5e-3

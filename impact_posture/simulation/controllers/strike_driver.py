@@ -22,8 +22,8 @@ class StrikeDriver(ImpactFeedbackDriver):
     """Nominal controller whose references follow a path that strikes (:mod:`impact_posture.path.strike`).
 
     After :meth:`brace`, the robot moves to the beginning of the run-up.  The run-up ends at the expected time of the
-    impact.  If there is no contact yet, the references continue at the velocity of the impact.  The contact is felt
-    by the force sensor, or because the contact point has less than half of its planned speed.  At the contact, or
+    impact.  If there is no contact yet, the references continue at the velocity of the impact.  The force sensor
+    detects the contact, or a speed of the contact point below half of the planned speed.  At the contact, or
     :attr:`LATE` after the expected time, the references switch to the stop after the impact.  When the end effector
     has to return, the robot moves back to the beginning of the run-up.
 
