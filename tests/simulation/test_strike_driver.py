@@ -6,18 +6,22 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 from impact_posture.path.posture_path import PosturePath
+from impact_posture.path.strike import Strike
 from impact_posture.simulation.controllers.contact_reference import Reference
 from impact_posture.simulation.controllers.controller_factory import ControllerFactory
 from impact_posture.simulation.controllers.strike_driver import StrikeDriver
+from impact_posture.simulation.controllers.task_formulations import nominal_posture
 from impact_posture.simulation.metrics import measure
 from impact_posture.simulation.outcome import judge
 from impact_posture.simulation.prediction import predict
 from impact_posture.simulation.run import Run
 from impact_posture.simulation.scenario_file import RepeatedContacts
 from impact_posture.simulation.setup import set_up
+from impact_posture.tsid.state import State
 from tests.simulation.factories import controller_factory, driven, shortened
 
 pytest.importorskip("toppra", reason="toppra is not installed (the extra 'path')")
@@ -95,3 +99,30 @@ def test_a_push_is_awaited_in_the_optimum() -> None:
     factory.starts = 1
     driver = factory.driver("strike")
     assert not isinstance(driver, StrikeDriver) and factory.path_of("strike") is None
+
+
+def test_accelerations_of_a_robot_with_rotors_are_ahead_by_the_lag_of_its_thrust() -> None:
+    setup = shortened("aerial-vertical", count=1, settle=0.8)
+    model, rotors = setup.robot.model, setup.robot.spec.propulsion
+    assert rotors is not None
+    # The robot descends by 5 cm in 0.2 s, and arrives at 0.5 m/s.
+    times, down = np.linspace(0.0, 0.2, 21), np.eye(model.nv)[2]
+    travel = np.polynomial.Polynomial([0.0, 0.0, 0.0, -0.5 / 0.2**2, 0.5 / 2 / 0.2**3])
+    rows = [[float(p(t)) * down for t in times] for p in (travel, travel.deriv(), travel.deriv(2))]
+    postures = np.array([pin.integrate(model, setup.q, step) for step in rows[0]])
+    strike = Strike(0.5, 0.5, 0.0, 0.05, 0.2, rows[1][-1], 0.0)
+    path = PosturePath(
+        model, times, postures, np.array(rows[1]), np.array(rows[2]), found=True, reason="", method="", timing="",
+        objective=0.0, length=0.05, max_violation=0.0, strike=strike,
+    )  # fmt: skip
+    driver = StrikeDriver(setup, nominal_posture(setup), path)
+    driver.reset(setup.q)
+    driver.brace()
+    driver.expect(0.2)
+    lag = (rotors.time_constant_up + rotors.time_constant_down) / 2
+    task = driver.posture
+    for t in (0.05, 0.1, 0.15):
+        driver.lead(t)
+        wanted = task.desired(State(setup.robot).update(path.at(t)[0], path.at(t)[1]))
+        np.testing.assert_allclose(wanted, path.at(t + lag)[2], atol=1e-9)
+        assert abs(wanted[2] - path.at(t)[2][2]) > 0.1

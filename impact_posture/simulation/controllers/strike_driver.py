@@ -27,6 +27,9 @@ class StrikeDriver(ImpactFeedbackDriver):
     :attr:`LATE` after the expected time, the references switch to the stop after the impact.  When the end effector
     has to return, the robot moves back to the beginning of the run-up.
 
+    The thrust of rotors lags behind its command, so the accelerations of a robot with rotors are ahead of the other
+    references by the mean time constant of the rotors.
+
     Attributes:
         path: Path with a strike.
     """
@@ -41,6 +44,8 @@ class StrikeDriver(ImpactFeedbackDriver):
         self.path, self._strike, after = path, path.strike, path.strike.follow_through
         self._after = None if after is None else after.rows
         self._body = BodyTaskLead(setup.robot.model)
+        rotors = setup.robot.spec.propulsion
+        self._lag = 0.0 if rotors is None else (rotors.time_constant_up + rotors.time_constant_down) / 2
         self._begin()
 
     def _begin(self) -> None:
@@ -78,7 +83,8 @@ class StrikeDriver(ImpactFeedbackDriver):
             return
         if reference is not None and reference.speed < 0 and self._hit < np.inf:
             self._retreat()
-        q, v, a = self._moment = self._moment_at(t)
+        q, v, _ = self._moment = self._moment_at(t)
+        a = self._moment_at(t + self._lag)[2]
         self.posture.lead(q, v, a)
         self._body.lead(self._body_tasks, q, v, a)
         task = self._end_effector
