@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,6 +20,12 @@ if sys.dont_write_bytecode and not sys.pycache_prefix:
 # Limit the threads before numpy is imported, because parallel test workers would each start a thread per core.
 for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(name, "1")
+
+# A background job of a shell ignores SIGINT, and a program under nohup ignores SIGHUP.  The programs that tests start
+# would inherit this, but not a handler that does nothing.
+for number in (signal.SIGINT, signal.SIGHUP):
+    if signal.getsignal(number) is signal.SIG_IGN:
+        signal.signal(number, lambda *_: None)
 
 import pytest  # noqa: E402
 from hypothesis import HealthCheck, settings  # noqa: E402

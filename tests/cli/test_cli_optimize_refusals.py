@@ -150,10 +150,8 @@ def test_infeasible_exits_3_and_names_the_conflict(tmp_path: Path) -> None:
 def test_interrupt_in_mid_solve_leaves_nothing(jobs: int, tmp_path: Path) -> None:
     command = [str(COMMAND), *map(str, BASE), "--starts", "100000", "--jobs", str(jobs)]
     process = subprocess.Popen(
-        command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
-        # A shell starts background programs so that they ignore SIGINT.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )  # fmt: skip
+        command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
     assert process.stdout is not None
     while "joint limits" not in process.stdout.readline():
         assert process.poll() is None

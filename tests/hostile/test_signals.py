@@ -73,8 +73,6 @@ def send(name: str, k: int, number: signal.Signals, folder: Path) -> None:
     process = subprocess.Popen(
         [str(COMMAND), *arguments], cwd=work, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         start_new_session=True, env=os.environ | cache | {"TMPDIR": str(temporary)},
-        # Restore the SIGINT handler, because background processes of a shell ignore SIGINT.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )  # fmt: skip
     try:
         with contextlib.suppress(OSError):

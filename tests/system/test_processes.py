@@ -120,12 +120,9 @@ def test_leaving_early_leaves_no_process(fails: bool, tmp_path: Path) -> None:
 
 
 PROGRAM = """
-import os, signal, sys, time
+import os, sys, time
 from pathlib import Path
 from impact_posture.system.processes import fork_map
-
-# A shell ignores Ctrl-C for background processes, and their children inherit this.
-signal.signal(signal.SIGINT, signal.default_int_handler)
 
 def work(index):
     Path(sys.argv[1], str(os.getpid())).touch()
