@@ -22,6 +22,8 @@ _Result = TypeVar("_Result")
 MOST_MEMORY = 3 << 30
 # A call that sleeps this long, s, waits for a pipe or a device.  Waiting for a disk is not sleep, except for FUSE.
 _LONGEST_SLEEP = 1.0
+# Function of Linux in which a process sleeps while it waits for a file system of FUSE, such as sshfs.
+_FUSE = "request_wait_answer"
 _TOO_LARGE = "takes too much memory to read"
 # Time between two looks at a call, s.
 _PAUSE = 0.2
@@ -130,12 +132,18 @@ def _received(copy: Copy[_Outcome[_Result]], seconds: float) -> _Outcome[_Result
 
 
 def _activity(pid: int | None) -> tuple[bool, int]:
-    """Return whether a process sleeps, and its processor time in clock ticks; ``(False, 0)`` on other than Linux."""
+    """Return whether a process sleeps, but not for a disk, and its processor time in clock ticks.
+
+    The result is ``(False, 0)`` on other systems than Linux.
+    """
+    process = Path(f"/proc/{pid}")
     try:
-        fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
+        fields = (process / "stat").read_text(encoding="utf-8").rpartition(")")[2].split()
+        # The system may hide the function in which a process sleeps.  It is then "0".
+        sleeps = fields[0] == "S" and (process / "wchan").read_text(encoding="utf-8") != _FUSE
     except OSError:
         return False, 0
-    return fields[0] == "S", int(fields[11]) + int(fields[12])
+    return sleeps, int(fields[11]) + int(fields[12])
 
 
 def _memory() -> int:

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import errno
 import os
 import resource
 import signal
+import struct
 import subprocess
 import sys
+import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -81,6 +86,47 @@ def test_a_call_that_waits_for_a_pipe_fails(tmp_path: Path, monkeypatch: pytest.
     with pytest.raises(CallFailed, match="names a pipe or a device"):
         isolated_call((tmp_path / "pipe").read_bytes, 10.0)
     assert time.monotonic() - start < 5
+
+
+@pytest.fixture
+def slow_file(tmp_path: Path) -> Iterator[Path]:
+    """A file on a FUSE disk that answers every request after 0.8 s with an input/output error."""
+    path, system = tmp_path / "robot.xml", ctypes.CDLL(None)
+    path.touch()
+    try:
+        disk = os.open("/dev/fuse", os.O_RDWR)
+    except OSError:
+        pytest.skip("the system has no FUSE")
+    options = f"fd={disk},rootmode=100000,user_id={os.getuid()},group_id={os.getgid()}"
+
+    def serve() -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                _, operation, number = struct.unpack_from("IIQ", os.read(disk, 1 << 17))
+                if operation == 26:  # FUSE_INIT: answer with version 7.31, and writes of 4096 bytes.
+                    os.write(disk, struct.pack("IiQ2I12xI40x", 80, 0, number, 7, 31, 4096))
+                else:
+                    time.sleep(0.8)
+                    os.write(disk, struct.pack("IiQ", 16, -errno.EIO, number))
+
+    if system.mount(b"disk", bytes(path), b"fuse", 0, options.encode()):
+        os.close(disk)
+        pytest.skip("only root can mount a disk")
+    thread = threading.Thread(target=serve)
+    thread.start()
+    try:
+        yield path
+    finally:
+        system.umount2(bytes(path), 2)  # MNT_DETACH, which also ends the reads of the disk
+        thread.join()
+        os.close(disk)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="looks at processes in /proc")
+def test_a_call_may_wait_for_a_slow_disk(slow_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_LONGEST_SLEEP", 0.3)
+    with pytest.raises(OSError, match="Input/output error"):
+        isolated_call(slow_file.read_bytes, 10.0)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
