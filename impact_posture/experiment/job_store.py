@@ -37,10 +37,14 @@ class JobStore:
 
     The name of a file is a hash of the settings, robot files and software of its job (:func:`key_of`).  A document
     begins with its checksum and contains the checksums of its time series.  If a file is damaged, its job runs again.
+
+    Attributes:
+        folder: Path of the folder.
+        used: Whether :func:`run_batch` has returned stored documents.
     """
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self._used = folder, False
+        self.folder, self.used = folder, False
 
     @contextmanager
     def locked(self) -> Iterator[JobStore]:
@@ -56,7 +60,7 @@ class JobStore:
                 try:
                     yield self
                 except _BROKEN as error:
-                    if not self._used:
+                    if not self.used or isinstance(error, OSError):
                         raise
                     what = f"contains runs that cannot be used ({type(error).__name__}: {error})"
                     hint = "delete this folder, and report the error if it comes again"
@@ -91,7 +95,6 @@ class JobStore:
             document: Document = stored["document"]
         except (OSError, *_BROKEN):
             return None
-        self._used = True
         return document
 
     def finished(self, job: Job) -> Document:
@@ -190,6 +193,8 @@ def run_batch(
             done[waiting[index]] = document
             if progress:
                 progress(len(done), len(jobs))
+    if store is not None:
+        store.used |= len(waiting) < len(jobs)
     return [done[k] for k in range(len(jobs))]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import functools
+import io
 import json
 import os
 import re
@@ -231,6 +232,24 @@ def test_figures_are_not_drawn_without_a_finished_run(aerial: Path, tmp_path: Pa
     with pytest.raises(OutputError, match="was deleted or changed"), store_beside(tmp_path / "both") as store:
         draw_side_by_side(reproduction.shown, store, tmp_path, ["png"])
     assert not list(tmp_path.iterdir())
+
+
+def test_only_errors_after_the_use_of_stored_jobs_are_blamed_on_the_store(
+    aerial: Path, store: JobStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(job: Job) -> Any:
+        raise KeyError("a fault of the program")
+
+    job = Job(str(aerial), "nominal")
+    store.keep(job, {"runs": []})
+    monkeypatch.setattr(job_store, "execute", fail)
+    with pytest.raises(KeyError, match="a fault of the program"), store.locked():
+        run_batch([job, replace(job, seed=1)], store=store)
+    with pytest.raises(io.UnsupportedOperation), store.locked():
+        run_batch([job], store=store)
+        raise io.UnsupportedOperation("not writable")
+    with pytest.raises(OutputError, match=r"contains runs that cannot be used \(KeyError"), store.locked():
+        run_batch([job], store=store)[0]["metrics"]
 
 
 def test_a_full_disk_is_reported_and_keeps_stored_jobs(
