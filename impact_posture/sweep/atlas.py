@@ -13,9 +13,10 @@ from impact_posture.config.checked import checked
 from impact_posture.errors import OutputError, SpecError, listed
 from impact_posture.posture.formulation.problem_file import dump_settings
 from impact_posture.sweep.case_solver import CaseSolver
-from impact_posture.sweep.shard_table import passes_of, read_postures, shard_name
+from impact_posture.sweep.shard_table import origin_of, passes_of, read_postures, shard_name
 from impact_posture.sweep.sweep_file import Sweep
 from impact_posture.sweep.sweep_manifest import MANIFEST, check_key, manifest_text, read_manifest
+from impact_posture.system.folder_record import is_own
 from impact_posture.system.libraries import source_key
 from impact_posture.system.optional_package import import_extra
 from impact_posture.system.output_folder import used_alone, whole_folder, write_whole
@@ -61,7 +62,8 @@ class Atlas:
     def opened(self, force: bool = False) -> Iterator[None]:
         """Create the folder or continue in it, and lock it against other processes during the ``with`` block.
 
-        A damaged manifest is written again.  With ``force``, shards of another sweep or version are removed.
+        A damaged manifest is written again.  A missing manifest is written again if the checksums of all files show
+        that they are shards of this sweep.  With ``force``, shards of another sweep or version are removed.
 
         Raises:
             OutputError: The folder contains other files, or results of another sweep or version, or another process
@@ -69,10 +71,16 @@ class Atlas:
             SpecError: The manifest is too damaged to belong to a known sweep.
         """
         manifest, text = self.folder / MANIFEST, manifest_text(self._sweep, self._key)
-        if not os.path.isfile(manifest):
-            with whole_folder(self.folder, force=force, kind="sweep") as beside:
-                write_whole(beside / MANIFEST, text)
         other = False
+        if not os.path.isfile(manifest):
+            keys = self._keys()
+            if keys and (force or keys == {self._key}):
+                write_whole(manifest, text)
+                other = keys != {self._key}
+                self.damaged.add(MANIFEST)
+            else:
+                with whole_folder(self.folder, force=force, kind="sweep") as beside:
+                    write_whole(beside / MANIFEST, text)
         try:
             check_key(self.folder, self._key)
         except OutputError:
@@ -93,6 +101,24 @@ class Atlas:
                 with suppress(OSError):
                     part.unlink()
             yield
+
+    def _keys(self) -> set[str]:
+        """Return the keys of the sweeps of all shards in the folder; empty if the folder contains a foreign file."""
+        keys = set[str]()
+        try:
+            for path in self.folder.rglob("*"):
+                if path.is_dir() and not path.is_symlink():
+                    continue
+                name = path.relative_to(self.folder)
+                sealed = name.parts[0] in (_DATA, _FIRST_PASS)
+                key = origin_of(read_bytes(path), "/".join(name.parts[1:]))[0] if sealed else ""
+                if key:
+                    keys.add(key)
+                elif not is_own(self.folder, name.as_posix()):
+                    return set()
+        except OSError:
+            return set()
+        return keys
 
     def waiting(self) -> tuple[list[int], list[int]]:
         """Return the shards that need the first pass, and the shards that need the second pass."""

@@ -87,17 +87,27 @@ def passes_of(content: bytes, key: str, name: str) -> int:
 
     The result is 0 if the file is damaged, or is not the shard ``name`` of the sweep ``key``.
     """
+    sweep, passes = origin_of(content, name)
+    return passes if sweep == key else 0
+
+
+def origin_of(content: bytes, name: str) -> tuple[str, int]:
+    """Return the key of the sweep of a shard file, and after how many passes it was written, 1 or 2.
+
+    The result is ``("", 0)`` if the file is damaged, or is not the shard ``name`` of a sweep.
+    """
     import pyarrow as pa
     from pyarrow import ArrowException, parquet
 
     if not is_intact(content):
-        return 0
+        return "", 0
     try:
         metadata = parquet.read_metadata(pa.BufferReader(content)).metadata
-        fits = (metadata[b"sweep"], metadata[b"shard"]) == (key.encode(), name.encode())
-        return int(metadata[b"passes"]) if fits else 0
+        if metadata[b"shard"] != name.encode():
+            return "", 0
+        return metadata[b"sweep"].decode(), int(metadata[b"passes"])
     except (ArrowException, LookupError, TypeError):  # another sealed file, such as the manifest
-        return 0
+        return "", 0
 
 
 def _kind(axis: Axis) -> Any:

@@ -18,7 +18,7 @@ import pytest
 from pyarrow import parquet
 
 import impact_posture as ip
-from impact_posture.errors import ImpactPostureError, SpecError
+from impact_posture.errors import ImpactPostureError, OutputError, SpecError
 from impact_posture.sweep.atlas import Atlas, sweep_key
 from impact_posture.sweep.maps import draw_maps
 from impact_posture.sweep.sweep_file import Sweep, read_sweep
@@ -218,6 +218,31 @@ def test_a_damaged_manifest_is_written_again(solved: tuple[Sweep, str, Path], tm
     again = run_sweep(sweep, tmp_path / "out")
     assert (again.damaged, again.shards) == (("manifest.json",), 0)
     assert contents(tmp_path / "out") == contents(folder)
+
+
+@pytest.mark.parametrize("what", ["shards", "another sweep", "a foreign file", "a damaged shard"])
+def test_a_folder_without_its_manifest(what: str, solved: tuple[Sweep, str, Path], tmp_path: Path) -> None:
+    """Only files that their checksums prove to be shards are used, or removed by force."""
+    sweep, key, folder = solved
+    out = Path(shutil.copytree(folder, tmp_path / "out"))
+    (out / "manifest.json").unlink()
+    if what == "a foreign file":
+        (out / "data" / "notes.txt").write_text("mine")
+    elif what == "a damaged shard":
+        shards(out)[0].write_bytes(flip(shards(out)[0].read_bytes(), random.Random(1)))
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    new = Atlas(out, sweep, "another" if what == "another sweep" else key)
+    if what != "shards":
+        with pytest.raises(OutputError, match="exists"), new.opened():
+            pass
+    if what in ("a foreign file", "a damaged shard"):
+        with pytest.raises(OutputError, match="data/, which this command did not write"), new.opened(force=True):
+            pass
+        assert before == {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+        return
+    with new.opened(force=what == "another sweep"):
+        assert len(new.waiting()[1]) == (0 if what == "shards" else sweep.shards)
+    assert new.damaged == {"manifest.json"} and len(shards(out)) == (sweep.shards if what == "shards" else 0)
 
 
 def sealed_text(manifest: Any) -> str:
