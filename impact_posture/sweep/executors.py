@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,6 +13,32 @@ from typing import Any
 
 from impact_posture.errors import InputError
 from impact_posture.system.optional_package import import_extra
+
+# Time within which a Dask scheduler must answer, and time in which it can be told that the client leaves, s.
+_LONGEST_SILENCE, _LEAVING = 30, 5
+
+
+class DaskWorkers(Executor):
+    """Executor of a Dask cluster, which can check that the scheduler of the cluster answers."""
+
+    def __init__(self, client: Any, address: str) -> None:
+        self._client, self._executor, self._address = client, client.get_executor(), address
+
+    def submit(self, function: Callable[..., Any], /, *arguments: Any, **named: Any) -> Future[Any]:
+        """Submit one call as a task."""
+        future: Future[Any] = self._executor.submit(function, *arguments, **named)
+        return future
+
+    def check(self) -> None:
+        """Wait for an answer of the scheduler, because a scheduler that is stopped keeps its connections open.
+
+        Raises:
+            TimeoutError: The scheduler does not answer.
+        """
+        try:
+            self._client.sync(self._client.scheduler.echo, data="", callback_timeout=_LONGEST_SILENCE)
+        except TimeoutError:
+            raise TimeoutError(f"{self._address} has not answered for {_LONGEST_SILENCE} s") from None
 
 
 @contextmanager
@@ -30,8 +56,12 @@ def dask_cluster(address: str) -> Iterator[Executor]:
     except (OSError, ValueError) as error:
         what, hint = f"no Dask scheduler answers ({error})", "start a scheduler, or correct the address"
         raise InputError(what, where=f"scheduler {address}", hint=hint) from None
-    with _unlogged("distributed", "distributed.client"), client:
-        yield client.get_executor()
+    with _unlogged("distributed", "distributed.client"):
+        try:
+            yield DaskWorkers(client, address)
+        finally:
+            with suppress(TimeoutError):
+                client.close(timeout=_LEAVING)
 
 
 @contextmanager

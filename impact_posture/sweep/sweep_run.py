@@ -19,6 +19,8 @@ Progress = Callable[[int, int], None]
 # Maximum number of shards that are submitted and not yet written.  A larger number needs more memory.  With a smaller
 # number, workers may have to wait for the next shard.
 IN_HAND = 64
+# Time after which an executor is checked if no shard was finished, s.
+_PAUSE = 5.0
 # Packages whose errors mean that an executor lost its workers.
 _EXECUTORS = ("distributed", "mpi4py", "submitit")
 
@@ -121,7 +123,7 @@ def _results(tasks: Iterable[tuple[Any, ...]], executor: Executor | None, in_han
         yield from (function(*values) for function, *values in tasks)
         return
     left, pending = iter(tasks), set[Future[ShardResult]]()
-    submit_all = getattr(executor, "submit_all", None)
+    submit_all, check = getattr(executor, "submit_all", None), getattr(executor, "check", None)
     while True:
         batch = [task for _, task in zip(range(in_hand - len(pending)), left, strict=False)]
         if submit_all and batch:
@@ -130,5 +132,7 @@ def _results(tasks: Iterable[tuple[Any, ...]], executor: Executor | None, in_han
             pending |= {executor.submit(*task) for task in batch}
         if not pending:
             return
-        finished, pending = wait(pending, return_when=FIRST_COMPLETED)
+        finished, pending = wait(pending, _PAUSE if check else None, FIRST_COMPLETED)
+        if check and not finished:
+            check()
         yield from (future.result() for future in finished)

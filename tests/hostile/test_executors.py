@@ -21,6 +21,7 @@ from pathlib import Path
 import pytest
 
 from impact_posture.errors import WorkerDied
+from impact_posture.sweep import sweep_run
 from impact_posture.sweep.sweep_file import read_sweep
 from impact_posture.sweep.sweep_run import run_sweep
 from tests.hostile.arena import Outcome
@@ -76,6 +77,26 @@ def test_errors_of_executors(k: int, at_submit: bool, sweep: Path, tmp_path: Pat
     assert len(list((tmp_path / "out").rglob("*.parquet"))) == 1
 
 
+class Stopped(Executor):
+    """Executor that never solves a shard, and whose check fails at its second call."""
+
+    checks = 0
+
+    def submit(self, function: Callable[..., object], /, *arguments: object, **named: object) -> Future[object]:
+        return Future()
+
+    def check(self) -> None:
+        self.checks += 1
+        if self.checks == 2:
+            raise TimeoutError("tcp://host has not answered for 30 s")
+
+
+def test_an_executor_that_does_not_answer(sweep: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sweep_run, "_PAUSE", 0.01)
+    with pytest.raises(WorkerDied, match=r"tcp://host has not answered for 30 s\); check them, and run the command"):
+        run_sweep(read_sweep(sweep), tmp_path / "out", Stopped())
+
+
 @contextlib.contextmanager
 def running(*words: object, **more: str) -> Iterator[subprocess.Popen[bytes]]:
     """Run a program during the block."""
@@ -123,7 +144,7 @@ def check(outcome: Outcome, sweep: Path, out: Path) -> None:
     assert shards(out) == shards(sweep.with_name("whole"))
 
 
-@pytest.mark.parametrize("victim", ["scheduler", "worker", "all workers"])
+@pytest.mark.parametrize("victim", ["scheduler", "stopped scheduler", "worker", "all workers"])
 def test_a_dask_cluster_is_killed(victim: str, sweep: Path, tmp_path: Path, hostile_full: bool) -> None:
     if not hostile_full:
         pytest.skip("a Dask cluster: give --hostile-full")
@@ -137,16 +158,16 @@ def test_a_dask_cluster_is_killed(victim: str, sweep: Path, tmp_path: Path, host
     worker = (*dask, "distributed.cli.dask_worker", address, "--no-dashboard", "--no-nanny", "--nthreads", 1,
               "--local-directory", tmp_path / "dask")  # fmt: skip
     with running(*scheduler) as first, running(*worker) as second, running(*worker) as third:
-        killed = {"scheduler": [first], "worker": [second], "all workers": [second, third]}[victim]
+        killed = {"worker": [second], "all workers": [second, third]}.get(victim, [first])
 
         def harm(pid: int) -> None:
             for process in killed:
-                os.killpg(process.pid, signal.SIGKILL)
+                os.killpg(process.pid, signal.SIGSTOP if victim == "stopped scheduler" else signal.SIGKILL)
             if victim == "all workers":
                 os.killpg(pid, signal.SIGINT)
 
         outcome = interrupted([*COMMAND, "sweep", str(sweep), "--scheduler", address], tmp_path / "out", harm)
-    assert outcome.code == {"scheduler": 1, "worker": 0, "all workers": 130}[victim], outcome.err
+    assert outcome.code == {"worker": 0, "all workers": 130}.get(victim, 1), outcome.err
     check(outcome, sweep, tmp_path / "out")
 
 
