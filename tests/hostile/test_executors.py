@@ -144,7 +144,7 @@ def check(outcome: Outcome, sweep: Path, out: Path) -> None:
     assert shards(out) == shards(sweep.with_name("whole"))
 
 
-@pytest.mark.parametrize("victim", ["scheduler", "stopped scheduler", "worker", "all workers"])
+@pytest.mark.parametrize("victim", ["scheduler", "worker", "all workers", "stopped scheduler", "stopped, Ctrl-C"])
 def test_a_dask_cluster_is_killed(victim: str, sweep: Path, tmp_path: Path, hostile_full: bool) -> None:
     if not hostile_full:
         pytest.skip("a Dask cluster: give --hostile-full")
@@ -162,12 +162,12 @@ def test_a_dask_cluster_is_killed(victim: str, sweep: Path, tmp_path: Path, host
 
         def harm(pid: int) -> None:
             for process in killed:
-                os.killpg(process.pid, signal.SIGSTOP if victim == "stopped scheduler" else signal.SIGKILL)
-            if victim == "all workers":
+                os.killpg(process.pid, signal.SIGSTOP if "stopped" in victim else signal.SIGKILL)
+            if victim in ("all workers", "stopped, Ctrl-C"):
                 os.killpg(pid, signal.SIGINT)
 
         outcome = interrupted([*COMMAND, "sweep", str(sweep), "--scheduler", address], tmp_path / "out", harm)
-    assert outcome.code == {"worker": 0, "all workers": 130}.get(victim, 1), outcome.err
+    assert outcome.code == {"worker": 0, "all workers": 130, "stopped, Ctrl-C": 130}.get(victim, 1), outcome.err
     check(outcome, sweep, tmp_path / "out")
 
 
