@@ -10,12 +10,14 @@ import numpy as np
 from impact_posture.config.json_block import JsonBlock
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import InputError
+from impact_posture.impact.impact_contact import point_on
 from impact_posture.path.actuator_limits import ActuatorLimits
 from impact_posture.path.follow_through import FollowThrough
 from impact_posture.path.path_space import PathSpace
 from impact_posture.path.strike_spaces import StrikeSpaces
 from impact_posture.path.stroke import shortest_stroke
 from impact_posture.path.timed_curve import TimedCurve, sampled
+from impact_posture.posture.constraints.center_of_mass_over_feet import CenterOfMassOverFeet
 from impact_posture.posture.program.certificate import linearized_limits
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem
 from impact_posture.system.arrays import Array, null_space
@@ -86,12 +88,30 @@ def _leaving(space: PathSpace, q: Array) -> Array:
     ])  # fmt: skip
 
 
-def impact_velocity(spaces: StrikeSpaces, q: Array, speed: float) -> tuple[Array, float] | None:
+def _tipping(problem: ConstrainedProblem, model: Numeric) -> Array:
+    """Return rows ``B``, shape (k, nv): the capture point ``c + ċ √(z/g)`` is above the feet if ``Bν ≤ 1``.
+
+    ``z`` is the height of the center of mass ``c`` above the feet (Pratt et al. 2006).
+    """
+    over = next((c for c in problem.constraints if isinstance(c, CenterOfMassOverFeet)), None)
+    if over is None:
+        return np.zeros((0, model.model.nv))
+    beyond, jacobian = over.evaluate(model)
+    feet = [point_on(problem.robot, s.frame, s.offset) for s in problem.objective.supports]
+    height = model.center_of_mass()[0][2] - np.mean([model.placement(foot).translation[2] for foot in feet])
+    gravity = np.linalg.norm(problem.robot.model.gravity.linear)
+    return np.asarray(jacobian / (-beyond * np.sqrt(gravity / height))[:, None])
+
+
+def impact_velocity(
+    spaces: StrikeSpaces, q: Array, speed: float, *, balanced: bool = True
+) -> tuple[Array, float] | None:
     """Return ``ν`` with ``Jν = −v n`` on the constraints of the run-up, and its largest share of a velocity limit.
 
-    The motion comes from postures within all inequalities and joint limits.  The velocity minimizes
-    ``max |ν_i|/ν̄_i``, plus a small weight times ``Σ (ν_i/ν̄_i)²`` that makes it unique.
-    Entries without a limit count only in the sum, in rad/s or m/s.  Return ``None`` if no velocity exists.
+    The motion comes from postures within all inequalities and joint limits.  The velocity minimizes the largest of
+    ``|ν_i|/ν̄_i`` and, if ``balanced``, of the shares of :func:`_tipping`, plus a small weight times ``Σ (ν_i/ν̄_i)²``
+    that makes it unique.  Entries without a limit count only in the sum, in rad/s or m/s.  Return ``None`` if no
+    velocity exists.
     """
     robot = spaces.run_up.problem.robot
     limited = np.isfinite(robot.velocity_limits)
@@ -102,14 +122,16 @@ def impact_velocity(spaces: StrikeSpaces, q: Array, speed: float) -> tuple[Array
     if np.abs(A @ least - b).max() > _MISSED * speed:
         return None
     N = null_space(A, 1e-9)
-    # The unknowns are z and s: ν/ν̄ = least + N z, and its entries with a limit are at most s in size.
-    of, one, count = N[limited], np.ones((int(limited.sum()), 1)), N.shape[1]
+    # The unknowns are z and s: ν/ν̄ = least + N z, and all shares are at most s.
+    single, count = np.eye(len(scale))[limited], N.shape[1]
+    tipping = _tipping(spaces.run_up.problem, Numeric(robot.model).at(q)) * scale
+    shares = np.vstack([single, -single, *([tipping] if balanced else [])])
     leaving = _leaving(spaces.run_up, q) * scale
-    upper = np.concatenate([-least[limited], least[limited], leaving @ least])
+    upper = np.concatenate([-shares @ least, leaving @ least])
     x, _, flag, _ = daqp.solve(
         _UNIQUE * np.eye(count + 1),
         np.append(np.zeros(count), 1.0),
-        np.vstack([np.block([[of, -one], [-of, -one]]), np.column_stack([-leaving @ N, np.zeros(len(leaving))])]),
+        np.column_stack([np.vstack([shares @ N, -leaving @ N]), np.repeat([-1.0, 0.0], [len(shares), len(leaving)])]),
         upper,
         np.full_like(upper, -1e30),
         np.zeros(len(upper), dtype=np.int32),
@@ -138,16 +160,28 @@ class RunUp:
 def run_up(problem: ConstrainedProblem, q: Array, speed: float, limits: ActuatorLimits) -> RunUp | str:
     """Return the shortest run-up to the stated speed at ``q``, or to the greatest speed; or why none exists.
 
-    The contact frame turns only if there are too few joints to prevent it.
+    The contact frame turns only if there are too few joints to prevent it.  The capture point of a robot that stands
+    stays away from the edges of the feet, unless this bounds the speed.
     """
-    for turns in (False, True):
-        spaces = StrikeSpaces(problem, q, turns=turns)
-        impact = impact_velocity(spaces, q, speed)
-        if impact is not None:
-            break
-    else:
-        return "the joints cannot move the contact along the normal"
-    space, (velocity, share) = spaces.run_up, impact
+    spaces = StrikeSpaces(problem, q)
+    fastest: RunUp | str = "the joints cannot move the contact along the normal"
+    if impact_velocity(spaces, q, speed) is None:
+        spaces = StrikeSpaces(problem, q, turns=True)
+    for balanced in (True, False) if problem.requirements.com_over_feet else (False,):
+        impact = impact_velocity(spaces, q, speed, balanced=balanced)
+        run = fastest if impact is None else _timed_run_up(spaces, q, *impact, speed, limits)
+        if isinstance(run, RunUp) and not run.strike.hindrance:
+            return run
+        if isinstance(fastest, str) or (isinstance(run, RunUp) and run.strike.speed > fastest.strike.speed):
+            fastest = run
+    return fastest
+
+
+def _timed_run_up(
+    spaces: StrikeSpaces, q: Array, velocity: Array, share: float, speed: float, limits: ActuatorLimits
+) -> RunUp | str:
+    """Return the shortest run-up to the velocity of :func:`impact_velocity`, or to the greatest share of it."""
+    space, problem = spaces.run_up, spaces.run_up.problem
     low, high, hindrance = 0.0, 1.0, ""
     if share > 1:
         worst = int(np.argmax(np.abs(velocity) / problem.robot.velocity_limits))

@@ -64,7 +64,7 @@ class OfflinePosture:
 
 
 def offline_posture(
-    setup: Setup, objective: WorstCaseObjective, *, starts: int = 8, at_contact: bool = True
+    setup: Setup, objective: WorstCaseObjective, *, starts: int = 8, at_contact: bool = True, keep_feet: bool = False
 ) -> OfflinePosture:
     """Optimize the posture for the impact of a scenario.
 
@@ -78,7 +78,10 @@ def offline_posture(
     - The feet of a standing robot stay in place.  The center of mass is above the feet, and the base tilts at most as
       far as the reference flow allows.
 
-    If every posture that the search reaches collides, the result is the best of these postures with a ``note``.
+    - With ``keep_feet``, no foot of a standing robot lifts or slides during the impact.
+
+    If no posture satisfies the last requirement, or if every posture that the search reaches collides, the result is
+    the best posture without this requirement, with a ``note``.
 
     Raises:
         Infeasible, SolverFailed: As in :func:`impact_posture.posture.search.multistart.solve`.
@@ -87,22 +90,28 @@ def offline_posture(
     wanted, note = scenario_requirements(setup, objective, at_contact=at_contact), ""
     # A robot that does not stand has no support polygon, so the second margin is zero.
     margins = dict.fromkeys((stops, edges if wanted.com_over_feet else 0.0) for stops, edges in _MARGINS)
-    attempts = [(collision, *margin) for collision in (True, False) for margin in margins]
-    for collision, stops, edges in attempts:
-        demands = replace(wanted, collision=collision, limit_margin=stops, com_margin=edges)
+    kept = keep_feet and bool(objective.supports)
+    levels = dict.fromkeys(((kept, True), (False, True), (False, False)))
+    attempts = [(*level, *margin) for level in levels for margin in margins]
+    for keep, collision, stops, edges in attempts:
+        demands = replace(wanted, keep_contacts=keep, collision=collision, limit_margin=stops, com_margin=edges)
         try:
             with naming_keys(setup.scenario):
                 problem = build_problem(setup.robot, objective, setup.q, demands)
                 solution = solve(problem, starts=starts, jobs=1, progress=_tell)
         except (Infeasible, SolverFailed) as error:
-            if (collision, stops, edges) == attempts[-1]:
+            if (keep, collision, stops, edges) == attempts[-1]:
                 raise
-            if collision:
+            if keep:
+                note = (
+                    f"feet may lift or slide at the impact, because no posture in which they stay is known: {error}"
+                )
+            elif collision:
                 note = f"links may touch in the offline posture, because none without collisions is known: {error}"
             continue
         value, initial = objective.value(solution.q), objective.value(solution.initial)
         moved = distance(Chart(setup.robot.model), solution.q, solution.initial)
-        return OfflinePosture(solution, value, initial, moved, "" if collision else note)
+        return OfflinePosture(solution, value, initial, moved, note if (keep, collision) != attempts[0][:2] else "")
     raise AssertionError("the last attempt returns or raises")
 
 

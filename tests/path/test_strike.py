@@ -35,6 +35,7 @@ from impact_posture.posture.formulation.build_problem import build_problem
 from impact_posture.posture.formulation.problem_file import prepare
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem, equality_jacobian
 from impact_posture.posture.search.multistart import PostureSolution, solve
+from impact_posture.robot.support_polygon import polygon_edges
 from impact_posture.system.arrays import Array
 from tests.support.command import run
 from tests.support.constraints import check_expression
@@ -144,6 +145,23 @@ def test_velocities_that_leave_an_active_bound_are_preferred() -> None:
     blocked = replace(solution.problem, lower=lower, upper=upper)
     velocity = impact_velocity(StrikeSpaces(blocked, at), at, SPEED)
     assert velocity is None or sign * velocity[0][worst] <= 1e-9
+
+
+def test_a_balanced_velocity_keeps_the_capture_point_away_from_the_edges_of_the_feet() -> None:
+    solution, path = struck("solo8")
+    problem, q, distances = solution.problem, path.q[-1], []
+    loaded, data = problem.robot, problem.robot.model.createData()
+    pin.framesForwardKinematics(loaded.model, data, q)
+    feet = [data.oMf[loaded.frame_id(support.frame)].translation for support in problem.objective.supports]
+    edges = polygon_edges(foot[:2] for foot in feet)
+    assert edges is not None
+    for balanced in (True, False):
+        velocity = impact_velocity(StrikeSpaces(problem, q), q, SPEED, balanced=balanced)
+        assert velocity is not None
+        com, speed = pin.centerOfMass(loaded.model, data, q, velocity[0]), data.vcom[0]
+        capture = com + speed * np.sqrt((com[2] - feet[0][2]) / 9.81)
+        distances.append((edges[1] - edges[0] @ capture[:2]).min())
+    assert distances[0] > distances[1] + 0.01
 
 
 WALL = 'default_posture = "wall"\n[postures.wall]\njoints = { slide = 0.0 }\n[contact]\nframe = "cart"\n'

@@ -126,7 +126,7 @@ class ControllerFactory:
     _fault: str = ""
     _objectives: dict[ObjectiveKind, WorstCaseObjective] = field(default_factory=dict)
     _gradients: dict[ObjectiveKind, tuple[Gradient, tuple[str, ...]]] = field(default_factory=dict)
-    _offline: dict[tuple[ObjectiveKind, bool], OfflinePosture] = field(default_factory=dict)
+    _offline: dict[tuple[ObjectiveKind, bool, bool], OfflinePosture] = field(default_factory=dict)
 
     def objective(self, kind: ObjectiveKind = "impulse") -> WorstCaseObjective:
         """Return the objective of type ``kind`` (``impulse``, ``speed``, …) for the impact of the scenario."""
@@ -161,13 +161,14 @@ class ControllerFactory:
 
     def _optimum(self, name: str) -> OfflinePosture:
         # With the controller ``path``, the end effector must stay at its start, so its optimum differs from the
-        # optimum of ``posture``.
-        kind, at_contact = _KINDS.get(name, "impulse"), name != "path"
-        if (kind, at_contact) not in self._offline:
-            self._offline[kind, at_contact] = self.offline_of(
-                self.setup, self.objective(kind), starts=self.starts, at_contact=at_contact
+        # optimum of ``posture``.  The plan of a strike assumes that the feet stay.
+        kind, strikes = _KINDS.get(name, "impulse"), name == "strike" and self.setup.scenario.contacts is not None
+        key = kind, name != "path", strikes
+        if key not in self._offline:
+            self._offline[key] = self.offline_of(
+                self.setup, self.objective(kind), starts=self.starts, at_contact=key[1], keep_feet=strikes
             )
-        return self._offline[kind, at_contact]
+        return self._offline[key]
 
     @cached_property
     def path(self) -> PosturePath:
