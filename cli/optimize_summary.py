@@ -99,7 +99,7 @@ def summarize(page: Page, prepared: Prepared, solution: PostureSolution, documen
     left = solution.dominated_starts
     page.line(
         f"{solution.certified_starts} of {solution.starts} starts certified in {solution.solve_time_s:.1f} s; "
-        + (f"{left} could not become the best (--finish-all); " if left else "")
+        + (f"{left} stopped early (--finish-all finishes them); " if left else "")
         + f"optima: {optima}"
     )
     page.line(document["search"]["line"])

@@ -52,7 +52,7 @@ class Stroke:
     Args:
         space: Postures that the curve may pass.
         q: Posture with the velocity ``u``, shapes (nq,) and (nv,).
-        rows: The matrix ``A``, shape (m, nv), from the model at a posture.
+        rows: Function that returns the matrix ``A``, shape (m, nv), for the model at a posture.
         time: Length of the curve, as the largest ``b``, s.
         before: Whether the curve ends at ``q``, instead of beginning there.
 

@@ -171,7 +171,7 @@ class PlacedJump(NamedTuple):
 
 
 def unknown_jump(case: ImpactCase, tree: Tree, impact: Wrench, label: str = "") -> UnknownJump:
-    """Return unknowns and equations for the velocity jump at ``tree.q`` that the impulse ``impact`` causes."""
+    """Return unknowns and equations for the velocity jump that the impulse ``impact`` causes at ``tree.q``."""
     a = ca.SX.sym(f"a{label}", tree.nv)
     velocities = tree.velocities(a)
     feet = [Foot(point_on(case.robot, s.frame, s.offset), s.rows) for s in case.supports]

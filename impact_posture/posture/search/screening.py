@@ -51,8 +51,8 @@ _SAME = 0.05
 # doubles this number, because the number of optima grows exponentially with the degrees of freedom.
 _HITS, _FREE, _ENDS, _IDLE = 12, 5, 256, 0.5
 # Number of starts of IPOPT, half of them at the best ends and half at the most different good ends.  If descents
-# ignored no constraint, a third suffices.  The number, times the degrees of freedom, is limited by the second
-# number, because a solution takes longer for large robots.
+# ignored no constraint, a third suffices.  ``_SOLVED`` limits the number of starts times the degrees of freedom,
+# because a solution takes longer for large robots.
 _GUESSES, _SOLVED = 12, 200
 # Tag of a descent from a random posture.  The tag of a hop is the end where it started.
 _RANDOM = -1

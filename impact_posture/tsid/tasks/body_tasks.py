@@ -132,7 +132,7 @@ class BodyTaskLead:
                 task.target_velocity, task.target_acceleration = v[3:6], a[3:6]
 
     def reset(self, state: State) -> None:
-        """Set the targets of the moved tasks to their present outputs, with zero velocity and acceleration."""
+        """Set the targets that :meth:`lead` moved to the present outputs, with zero velocity and acceleration."""
         for task in self._led:
             task.target, task.target_velocity, task.target_acceleration = None, 0.0, 0.0
             task.reset(state)
