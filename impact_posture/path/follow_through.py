@@ -1,4 +1,4 @@
-"""The motion after the impact of a strike: it brings the robot to rest from the predicted or a similar state."""
+"""The motion after the impact of a strike: from the predicted state, or from a similar state, to rest."""
 
 from __future__ import annotations
 

@@ -181,7 +181,7 @@ def _struck(
     seed: int,
     effort: int,
 ) -> PosturePath | str:
-    """Return the path that strikes the first optimum with the stated or else the greatest speed; or why none does."""
+    """Return the path that strikes an optimum with the stated or else the greatest speed; or why no path strikes."""
     start, runs, first = solution.initial, list[tuple[int, RunUp]](), ""
     for k, target in _targets(solution, space):
         run = run_up(solution.problem, target, speed, limits)

@@ -28,8 +28,8 @@ from impact_posture.impact.quantities.impact_oracle import ImpactOracle
 from impact_posture.robot.robot_spec import Support
 from impact_posture.system.arrays import Array
 
-# A foot moves if its speed is above this share of the approach speed.  It also lifts if a point that moves leaves the
-# ground with a tenth of this speed; a point that slides stays on the ground.
+# A contact point moves if its speed is above this share of the approach speed.  A moving point lifts if its upward
+# speed is above a tenth of this value; otherwise it slides.
 _MOVES = 0.01
 # Number of steps of an impact in which the weight is counted.
 _STEPS = 8

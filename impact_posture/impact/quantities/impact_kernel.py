@@ -103,7 +103,7 @@ class ImpactKernel:
         """Return the tangent gradient of ``aᵀWa`` for the velocity jump ``a`` of a response, shape (nv,).
 
         If ``r`` is ``None``, the impulses that cause the jump are constant.  Otherwise a single impulse ``p(q)``
-        causes it, and ``∂pᵀJM⁻¹Wa = rᵀ∂B p`` with ``B = JM⁻¹Jᵀ``.
+        causes the jump, and ``∂pᵀJM⁻¹Wa = rᵀ∂B p`` with ``B = JM⁻¹Jᵀ``.
         """
         if self.metric.kind == "kinetic" and not self._supported and r is None:
             return self.tree.pair_gradient(jump, jump)

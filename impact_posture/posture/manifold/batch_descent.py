@@ -166,7 +166,8 @@ class BatchDescent:
         for _ in range(_ACTIVE_SETS):
             jacobian[rows] = np.where(free[rows, None, :], at.jacobian[rows], 0.0)
             inverse[rows] = right_inverse(jacobian[rows])
-            # The gradient minus the forces of the equalities: at a limit, its sign says whether the limit is active.
+            # The gradient minus the forces of the equalities: at a limit, the sign of this difference says whether
+            # the limit is active.
             multipliers[rows] = times(inverse[rows].transpose(0, 2, 1), at.gradient[rows])
             rest[rows] = at.gradient[rows] - times(at.jacobian[rows].transpose(0, 2, 1), multipliers[rows])
             before, free = free, ~self.manifold.blocked(x, -rest)

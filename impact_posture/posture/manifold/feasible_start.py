@@ -147,9 +147,9 @@ def feasible_start(problem: ConstrainedProblem, index: int, seed: int, candidate
 class StartDraw:
     """The random postures of one start, projected onto the constraints, and drawn when they are needed.
 
-    Odd starts lie near the posture ``around``, by default the given one.  Even starts lie anywhere within the limits.
-    Near starts reach the constraints more often; far starts lead to other optima.  ``projector`` may belong to the
-    same problem with fewer parts in its program.
+    Odd starts lie near the posture ``around``, by default the given posture.  Even starts lie anywhere within the
+    limits.  Near starts reach the constraints more often; far starts lead to other optima.  ``projector`` may belong
+    to the same problem with fewer parts in its program.
     """
 
     def __init__(

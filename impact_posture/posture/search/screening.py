@@ -26,14 +26,15 @@ from impact_posture.posture.search.unseen_optima import SAME_VALUE, hits_by_valu
 from impact_posture.system.arrays import Array
 
 # Number of descents under way.  New descents begin when a quarter of them has ended.  When no more descents may
-# begin, the search does not wait for this share, because a small batch takes nearly as long as a large one.
+# begin, the search does not wait for the slowest descents (at most the share ``_SLOWEST`` of the ended descents),
+# because a small batch takes nearly as long as a large one.
 _WIDTH, _SLOWEST = 512, 1 / 16
 # The number of descents, times the fourth power of the degrees of freedom, is limited by the first number, because
 # descents of large robots take longer.  At least the second number is allowed.
 _WORK, _LEAST = 40_000_000, 16
 # If less than the share ``_REACHED`` of the first random postures reaches the equalities, their ends differ too
-# little.  Then ``_FEASIBLE`` starts that satisfy all constraints descend too, but at most the share ``_PART`` of the
-# limit.
+# little.  Then ``_FEASIBLE`` starts that satisfy all constraints descend too, but at most the share ``_PART`` of all
+# allowed descents.
 _REACHED, _FEASIBLE, _PART = 0.4, 128, 1 / 8
 # Share of the new descents that are hops.
 _HOPPING = 0.75
@@ -177,7 +178,7 @@ class _Search:
         )
 
     def _hop(self, other: Array) -> tuple[Array, NDArray[np.int_]]:
-        """Return ends with some joints of other ends or of postures, shape (N, nx), and the index of each end."""
+        """Return good ends with some joints at values of other ends or of ``other``, (N, nx), and their indices."""
         rng, count = self._rng, len(other)
         rank = np.argsort(np.argsort(self._merit))
         weight = (1 + rank) ** -_RANKED / (1 + self._tries / _TIRED) ** 2

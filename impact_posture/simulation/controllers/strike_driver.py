@@ -22,13 +22,13 @@ class StrikeDriver(ImpactFeedbackDriver):
     """Nominal controller whose references follow a path that strikes (:mod:`impact_posture.path.strike`).
 
     After :meth:`brace`, the robot moves to the beginning of the run-up.  The run-up ends at the expected time of the
-    impact.  If there is no contact yet, the references continue at the velocity of the impact.  The force sensor
-    detects the contact, or a speed of the contact point below half of the planned speed.  At the contact, or
-    :attr:`LATE` after the expected time, the references switch to the stop after the impact.  When the end effector
-    has to return, the robot moves back to the beginning of the run-up.
+    impact.  If there is no contact yet, the references continue at the velocity of the impact.  The controller
+    detects the contact by the force sensor, or because the contact point has less than half of its planned speed.  At
+    the contact, or :attr:`LATE` after the expected time, the references switch to the stop after the impact.  When
+    the end effector has to return, the robot moves back to the beginning of the run-up.
 
-    The thrust of rotors lags behind its command, so the accelerations of a robot with rotors are ahead of the other
-    references by the mean time constant of the rotors.
+    The thrust of rotors lags behind its command, so the accelerations of a robot with rotors are sent earlier than
+    the other references, by the mean time constant of the rotors.
 
     Attributes:
         path: Path with a strike.
@@ -49,7 +49,7 @@ class StrikeDriver(ImpactFeedbackDriver):
         self._begin()
 
     def _begin(self) -> None:
-        # Motion to the beginning of the run-up, its first and last time in this motion, and the time when it began.
+        # Motion to the beginning of the run-up, the time at which this motion ends, and the time at which it began.
         self._way: RowInterpolation = self.path
         self._until, self._left = self._strike.run_up_s, np.inf
         # Time of the contact, and the displacement of the robot from its planned posture at this time.
@@ -91,7 +91,7 @@ class StrikeDriver(ImpactFeedbackDriver):
         if task is not None:
             state = self._state.update(q, v)
             J = task.jacobian(state)
-            # The pose of an end effector that regulates its position is an array.
+            # If the end effector task regulates only the position, its target is an array.
             task.target = task.present(state)
             task.target_velocity, task.target_acceleration = J @ v, J @ a + task.drift(state)
 
