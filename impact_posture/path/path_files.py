@@ -49,7 +49,7 @@ def write_path(folder: Path, robot: Robot, path: PosturePath) -> None:
     note = f"# The contact is at the last point, at {strike.contact_s:.9g} s."
     _write_rows(folder / "path", robot, path, arrays | {"contact": np.array(strike.contact_s)}, note, len(path.t) - 1)
     if (after := strike.follow_through) is not None and after.rows is not None:
-        note = "# The contact is at the first point, whose velocities are those after the predicted impact."
+        note = "# The contact is at the first point, with the velocities after the predicted impact."
         _write_rows(folder / "follow_through", robot, after.rows, {"contact": np.array(0.0)}, note, 0)
 
 

@@ -99,7 +99,7 @@ def scaled(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedC
         least[:] = 0.0
         speed = np.where(np.isfinite(speed), speed, _DEFAULT_SPEED)
         if not np.isfinite(space.problem.robot.velocity_limits).all():
-            notes.append(f"where no velocity limit is known, {_DEFAULT_SPEED:g} rad/s or m/s counts")
+            notes.append(f"where no velocity limit is known, {_DEFAULT_SPEED:g} rad/s or m/s is assumed")
     least = np.maximum(least, [float((np.abs(v) / speed).max()) for _, v, _ in rates])
     duration = max(float(least.max()), SAMPLE_TIME)
     if known and curve.corners.any():

@@ -203,7 +203,7 @@ def _struck(
             continue
         connection = connect(before, here, begin, seed, effort)
         if connection.path is None:
-            blocked = blocked or "no path leads to the begin of the run-up"
+            blocked = blocked or "no path leads to the beginning of the run-up"
             continue
         motion, strike = run.motion, run.strike
         if before.length(connection.path) > _NO_MOTION:

@@ -112,7 +112,7 @@ def test_the_run_up_is_straight_and_clear_and_keeps_feet_and_base(name: str) -> 
         if problem.surroundings is not None:
             assert not problem.surroundings.collisions(q)
     assert heights[0] == pytest.approx(strike.run_up_m, rel=1e-3) and (np.diff(heights) < 0).all()
-    # The robot leaves the begin of the run-up from rest, and the contact never enters the surface before.
+    # The robot leaves the beginning of the run-up from rest, and the contact never enters the surface before.
     assert np.abs(path.at(strike.run_up_s)[1]).max() < 1e-9
     assert min(n @ (contact_of(problem, q)[0].translation - home.translation) for q in path.q) > -1e-6
 

@@ -46,7 +46,7 @@ from impact_posture.system.arrays import Array
 # Length of arrows as a share of the limit of the panel.  The drawn cone has the same length.
 REACH = 0.92
 _FREE = "Free (thin): the same robot with feet that are not held."
-_CONE = "The objective counts the worst normal of the cone. All equally bad normals are drawn."
+_CONE = "The objective is the value for the worst normal of the cone. All equally bad normals are drawn."
 NOTES = (
     "The half-width of Λ$_c$ along any direction is the size ‖Δν‖ of the velocity jump that an impulse of 1 N·s "
     "along it causes. Planes show shadows (projections), not slices; √H is the distance of the tangent planes along "

@@ -122,7 +122,7 @@ def share_notes(where: str, data: NullSpacePath | TradeOffData) -> str:
     if "S" in missing:
         notes += f" S is undefined {where}."
         missing.remove("S")
-    return notes + (f" {', '.join(missing)} start at zero and cannot be divided by it." if missing else "")
+    return notes + (f" {', '.join(missing)} start at zero, which cannot be the divisor." if missing else "")
 
 
 _BOUNDS = {
@@ -214,7 +214,7 @@ _MOVED = {"v": "base along ", "w": "base about "}
 _LEAST = "If torques, thrusts and foot forces are not unique, their largest share of a limit is minimized."
 _NOTES = {
     "scaled": f"One time scale for the whole motion: its fastest instant just meets a limit. {_LEAST}",
-    "slowed": f"The limits allow the speed at each place. It is low at corners. {_LEAST}",
+    "slowed": f"The speed at each place is as high as the limits allow, and low at corners. {_LEAST}",
     "time-optimal": "Time-optimal: a limit is met all the time, up to 1 %; the curves join the points of the motion.",
 }
 
@@ -225,7 +225,7 @@ def motion_figure(view: ResultView) -> Figure:
     use = required(motion.use, "motion", "path", "run optimize again with `path`")
     notes = [_NOTES.get(motion.timing, "")]
     notes += [f"Note: {motion.reason}."] if motion.reason else []
-    notes += ["Dotted lines: begin of the run-up with a smooth rise of speed, and contact."] if motion.strike else []
+    notes += ["Dotted lines: start of the run-up (the speed rises smoothly), and contact."] if motion.strike else []
     with framed(*header_lines(view), 6.2, notes) as (figure, body):
         joints, objective, shares = body.subplots(3, 1, sharex=True, height_ratios=[1.4, 1, 1])
         # The integral of the velocity is continuous.  An angle would jump after a full turn.

@@ -98,8 +98,8 @@ class GlobalSearch:
         pieces = "1 component" if count == 1 else f"{count} components"
         return (
             f"self-motion followed on {pieces}: no posture there is better by more than {100 * self.bound.gap:.2g} % "
-            f"({self.word}); {missed} missed this one; the last {self.motion.unsuccessful} of {self.motion.starts} "
-            "random postures found no new component"
+            f"({self.word}); {missed} missed the best posture; the last {self.motion.unsuccessful} of "
+            f"{self.motion.starts} random postures found no new component"
         )
 
     @property

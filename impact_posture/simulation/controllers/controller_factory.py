@@ -48,7 +48,7 @@ Mode = Literal["live", "held"]
 # Controller name → description in tables and help.
 MEANING: dict[str, str] = {
     "nominal": "TSID with the start posture",
-    "robust": "its posture task with -K grad H, the paper's",
+    "robust": "nominal, with the impact-robust term -K grad H of the paper",
     "robust-speed": "like robust, with the gradient of V (jump per approach speed)",
     "robust-sticking": "like robust, with the gradient of S (jump if the contact sticks)",
     "robust-release": "like robust, without the nominal posture stiffness until H stops decreasing",
