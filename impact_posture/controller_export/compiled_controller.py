@@ -188,8 +188,8 @@ class CompiledController:
 
         Raises:
             InputError: The controller has no such task.
-            ValueError: The target of a pose is not a ``pin.SE3``, or another target has neither the shape (3,) nor,
-                for an orientation, (3, 3).
+            ValueError: The target of a pose is not a ``pin.SE3``, the target of an orientation does not have the
+                shape (3, 3), or another target does not have the shape (3,).
         """
         row = self._target(task)
         rows = next(t.rows for t in self._checked.tasks if t.name == task)

@@ -77,7 +77,7 @@ def read_mjcf(path: Path, root: Root | None) -> MjcfFile:
     """Compile an MJCF.  ``root`` adds or removes the free joint; ``None`` keeps the root of the file.
 
     Raises:
-        MjcfError: MuJoCo rejects the file, crashes, or takes too much time or memory.  Or the file couples joints by
+        MjcfError: MuJoCo rejects the file, crashes, or takes too much time or memory, or the file couples joints by
             loops, tendons or polynomials.
         InputError: MuJoCo is not installed.
     """
@@ -228,7 +228,7 @@ def _check_tree(model: Any, path: Path) -> None:
 
 
 def _tendon_terms(model: Any, k: int) -> dict[int, float]:
-    """Return joint → ``c`` for an equality ``Σ c (q − q⁰) = a₀`` of tendons with one or two joints, or nothing."""
+    """Return joint → ``c`` of a tendon equality ``Σ c (q − q⁰) = a₀`` with up to two joints; empty for all others."""
     mujoco, terms = import_mujoco(), dict[int, float]()
     curved = model.eq_obj2id[k] >= 0 and model.eq_data[k, 2:5].any()
     if curved or not model.eq_type[k] == mujoco.mjtEq.mjEQ_TENDON:

@@ -48,7 +48,8 @@ def joint_yield(objective: WorstCaseObjective, q: Array) -> JointYield | None:
     joints = np.ones(robot.nv, dtype=bool)
     if robot.floating:
         joints[v_slice(robot.model, 1)] = False
-    # Motions y of the basis with joint velocities v = N y: the contact moves by J N N_j⁺ v.
+    # N is the basis of the motions that keep the feet in place, and N_j its rows for the joints.  Joint velocities v
+    # then move the contact by J N N_j⁺ v.
     motion = J @ basis @ np.linalg.pinv(basis[joints[moving]])
     largest = float(np.linalg.norm(motion, 2)) if motion.size else 0.0
     return JointYield(float(np.linalg.norm(oracle.n @ motion)), largest) if largest > 0 else None

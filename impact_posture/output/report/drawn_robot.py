@@ -140,7 +140,7 @@ def draw_robot(robot: Robot, meshes: bool = False) -> DrawnRobot:
     licenses = {terms.package: terms for name, terms in known.items() if terms and name in drawn - hulls}
     notes = [*warnings, *placed.warnings]
     if hulls & drawn:
-        notes.append("convex hulls replace meshes, because the page would contain copies of them (`meshes`)")
+        notes.append("convex hulls replace meshes, unless `meshes` allows copies of meshes in the page")
     solids = list(placed.solids)
     if not parts:
         solids, parts = _sticks(robot)
