@@ -178,6 +178,7 @@ def _path(page: Page, path: dict[str, Any]) -> None:
         for what, unit, room in (
             ("from a joint limit", "rad (m)", after["joints"]),
             ("between bodies, beyond the clearance,", "m", after["clearance"]),
+            ("of the center of pressure", "m", after["center_of_pressure"]),
         ):
             if room:
                 where = f"{room['of']}, after {room['impact']}"

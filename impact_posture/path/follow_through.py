@@ -7,15 +7,17 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
+import pinocchio as pin
 
 from impact_posture.config.json_block import jsonable
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.impact.friction.contact_impulses import contact_impulses
+from impact_posture.impact.impact_contact import point_on
 from impact_posture.impact.worst_case.worst_normal import cone_axes
 from impact_posture.path.actuator_limits import ActuatorLimits
 from impact_posture.path.path_curve import PathCurve
 from impact_posture.path.path_space import PathSpace
-from impact_posture.path.row_interpolation import RowInterpolation
+from impact_posture.path.row_interpolation import Moment, RowInterpolation
 from impact_posture.path.strike_spaces import StrikeSpaces
 from impact_posture.path.stroke import shortest_stroke
 from impact_posture.path.time_law import TimeLaw
@@ -23,6 +25,7 @@ from impact_posture.path.timed_curve import moment, sampled
 from impact_posture.posture.constraints.clearance import Clearance
 from impact_posture.posture.program.certificate import linearized_limits
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem, equality_jacobian
+from impact_posture.robot.support_polygon import polygon_edges
 from impact_posture.system.arrays import Array
 
 # The similar states: coefficients of restitution, and factors on the velocity before the impact.
@@ -31,6 +34,8 @@ RESTITUTIONS, FACTORS = (0.0, 0.5), (0.8, 1.0, 1.2)
 _EDGE = 4
 # Number of postures of a stop at which its distances are measured.
 _POSTURES = 12
+# Feet are on level ground if their corners differ in height by less than this, m.
+_LEVEL = 1e-3
 
 
 @dataclass(frozen=True)
@@ -58,6 +63,8 @@ class FollowThrough:
         joints: Least distance from a joint limit; ``None`` without limits.
         clearance: Least distance between links and other bodies minus the clearance; ``None`` without shapes.
         hindrance: What prevents a stop, and after which impact; empty if all stops exist.
+        center_of_pressure: Least distance of the center of pressure from an edge of the support polygon; ``None``
+            without feet that span an area on level ground.
     """
 
     velocity: Array
@@ -68,6 +75,7 @@ class FollowThrough:
     joints: Room | None
     clearance: Room | None
     hindrance: str = ""
+    center_of_pressure: Room | None = None
 
     def to_dict(self) -> dict[str, object]:
         """Return JSON content, without the rows."""
@@ -126,9 +134,10 @@ def follow_through(
         impacts=len(impacts),
         stopped=len(stops),
         longest_s=max((stop.duration for stop in stops), default=0.0),
-        joints=_least(stops, lambda q: _to_limits(spaces.rebound, q)),
-        clearance=_least(stops, lambda q: _to_bodies(spaces.rebound, q)),
+        joints=_least(stops, lambda moment: _to_limits(spaces.rebound, moment[0])),
+        clearance=_least(stops, lambda moment: _to_bodies(spaces.rebound, moment[0])),
         hindrance=hindrance,
+        center_of_pressure=_least(stops, _to_edges(problem, q, limits)),
     )
 
 
@@ -142,9 +151,9 @@ class _Stop:
     duration: float
 
     @property
-    def postures(self) -> Iterator[Array]:
+    def moments(self) -> Iterator[Moment]:
         times = np.linspace(0.0, self.law.duration, _POSTURES)
-        return (moment(self.curve, self.law, float(t))[0] for t in times)
+        return (moment(self.curve, self.law, float(t)) for t in times)
 
 
 def _stop(impact: str, spaces: StrikeSpaces, q: Array, velocity: Array, limits: ActuatorLimits) -> _Stop | str:
@@ -163,8 +172,8 @@ def _stop(impact: str, spaces: StrikeSpaces, q: Array, velocity: Array, limits: 
     return _Stop(impact, stroke.curve, stroke.law(duration), duration)
 
 
-def _least(stops: Sequence[_Stop], distance: Callable[[Array], tuple[float, str]]) -> Room | None:
-    rooms = [Room(*distance(q), stop.impact) for stop in stops for q in stop.postures]
+def _least(stops: Sequence[_Stop], distance: Callable[[Moment], tuple[float, str]]) -> Room | None:
+    rooms = [Room(*distance(moment), stop.impact) for stop in stops for moment in stop.moments]
     least = min(rooms, key=lambda room: room.distance, default=None)
     return least if least is not None and np.isfinite(least.distance) else None
 
@@ -183,3 +192,28 @@ def _to_bodies(space: PathSpace, q: Array) -> tuple[float, str]:
     closest = [c.closest(numeric) for c in space.problem.constraints if isinstance(c, Clearance)]
     name, distance = min(closest, key=lambda pair: pair[1], default=("", np.inf))
     return distance, name
+
+
+def _to_edges(problem: ConstrainedProblem, q: Array, limits: ActuatorLimits) -> Callable[[Moment], tuple[float, str]]:
+    """Return a function for the least distance of the center of pressure from an edge of the support polygon, m.
+
+    The center of pressure is where the contact forces have no horizontal moment.  The result is infinity if the feet
+    do not span an area on level ground.
+    """
+    numeric, robot = Numeric(problem.robot.model).at(q), problem.robot
+    points = [point_on(robot, foot.frame, corner) for foot in problem.objective.supports for corner in foot.corners]
+    corners = np.array([numeric.placement(point).translation for point in points]).reshape(-1, 3)
+    edges = polygon_edges(corners[:, :2]) if len(corners) and np.ptp(corners[:, 2]) < _LEVEL else None
+
+    def distance(moment: Moment) -> tuple[float, str]:
+        if edges is None:
+            return np.inf, ""
+        base = pin.XYZQUATToSE3(moment[0][:7])
+        # The wrench of the feet on the base, about the point of the ground below the origin of the world.
+        ground = pin.SE3(np.eye(3), -corners[:, 2].mean() * np.array([0.0, 0.0, 1.0]))
+        wrench = (ground * base).act(pin.Force(limits.load(*moment)[:6]))
+        center = np.array([-wrench.angular[1], wrench.angular[0]]) / wrench.linear[2]
+        normals, offsets = edges
+        return float((offsets - normals @ center).min()), "the edge of the feet"
+
+    return distance

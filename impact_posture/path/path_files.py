@@ -116,7 +116,8 @@ def _read_strike(folder: Path, block: Mapping[str, Any], robot: Robot) -> Strike
     rows = None
     if block["follow_through"]["duration_s"] is not None:
         rows, _ = _read_rows(folder / "follow_through.npz", robot)
-    after |= {key: Room(**after[key]) for key in ("joints", "clearance") if after[key] is not None}
+    rooms = ("joints", "clearance", "center_of_pressure")
+    after |= {key: Room(**after[key]) for key in rooms if after.get(key) is not None}
     ends = FollowThrough(**after | {"velocity": velocities[1], "rows": rows})
     return Strike(**{**block, "velocity": velocities[0], "follow_through": ends})
 

@@ -19,6 +19,7 @@ from impact_posture.path.reachable_curve import ReachableCurve
 from impact_posture.path.row_interpolation import INTERPOLATION, RowInterpolation
 from impact_posture.path.strike import RunUp, Strike, check_strike, run_up
 from impact_posture.path.timed_curve import TimedCurve
+from impact_posture.posture.approach.approach_speed import ApproachSpeed
 from impact_posture.posture.search.multistart import PostureSolution
 from impact_posture.system.arrays import Array
 
@@ -26,6 +27,8 @@ from impact_posture.system.arrays import Array
 _NOT_SMOOTH = "no smooth curve through the path satisfies the constraints"
 # Largest number of optima to try, best first.
 _OPTIMA = 5
+# An optimum with a larger objective is struck instead if its speed exceeds the greatest speed so far by this factor.
+_FASTER = 1.02
 # A path below this tangent length counts as no motion.  A relative gain below the second value counts as no gain.
 _NO_MOTION, _NO_GAIN = 1e-6, 1e-6
 # Largest number of reached postures to evaluate if no optimum is reached.
@@ -158,13 +161,13 @@ def _finished(
     method: str,
     limits: ActuatorLimits,
     failure: str,
-    *notes: str,
+    note: str = "",
     strike: Strike | None = None,
 ) -> PosturePath:
     """Return the path with the shares of the limits and the objective along it."""
     rows, use, objective = motion.rows, limit_use(space, motion, limits), space.problem.objective
     objectives = np.array([objective.value(rows.at(t)[0]) for t in use.at])
-    reason = "; ".join(filter(None, [failure, *notes, *motion.notes]))
+    reason = "; ".join(filter(None, [failure, note, *motion.notes]))
     return PosturePath(
         **vars(rows), found=not failure, reason=reason, method=method, timing=motion.method,
         objective=float(objective.value(rows.q[-1])), length=space.length(rows.q),
@@ -181,48 +184,54 @@ def _struck(
     seed: int,
     effort: int,
 ) -> PosturePath | str:
-    """Return the path that strikes an optimum with the stated or else the greatest speed; or why no path strikes."""
-    start, runs, first = solution.initial, list[tuple[int, RunUp]](), ""
+    """Return the path that strikes the first optimum with the stated or else the greatest speed; or why none does."""
+    # The program requires the greatest possible speed if no posture allows the stated speed.
+    required = min([speed, *(c.speed for c in solution.problem.constraints if isinstance(c, ApproachSpeed))])
+    best: tuple[int, RunUp, str] | None = None
+    failure = ""
     for k, target in _targets(solution, space):
         run = run_up(solution.problem, target, speed, limits)
-        if isinstance(run, str):
-            first = first or run
+        if not isinstance(run, str) and best and run.strike.speed < _FASTER * best[1].strike.speed:
             continue
-        runs.append((k, run))
-        if not run.strike.hindrance:
+        led = run if isinstance(run, str) else _led(solution.initial, run, limits, seed, effort)
+        if isinstance(led, str):
+            failure = failure or led
+            continue
+        best, struck = (k, *led), led[0].strike
+        if not struck.hindrance or struck.speed >= required:
             break
-        most = f"at {run.strike.speed:.3g} m/s at most, because of {run.strike.hindrance}"
-        first = first or f"the optimum can be struck {most}"
-    blocked = ""
-    for k, run in sorted(runs, key=lambda each: -each[1].strike.speed):
-        before, begin = run.spaces.approach, run.motion.rows.q[0]
-        # At the start, the contact point can be behind the surface at the optimum, and must then leave it.
-        here = start if before.valid(start) else before.pulled(start)
-        if here is None:
-            blocked = blocked or _fault(before, start)
-            continue
-        connection = connect(before, here, begin, seed, effort)
-        if connection.path is None:
-            blocked = blocked or "no path leads to the beginning of the run-up"
-            continue
-        motion, strike = run.motion, run.strike
-        if before.length(connection.path) > _NO_MOTION:
-            there = _timed(before, connection.path, limits, seed)
-            if there is None:
-                blocked = blocked or _NOT_SMOOTH
-                continue
-            shift = float(there.rows.t[-1])
-            motion = TimedCurve(there.rows.followed_by(motion.rows), there.method, (*there.notes, *motion.notes))
-            strike = replace(strike, run_up_s=shift, contact_s=float(motion.rows.t[-1]))
-        after = follow_through(solution.problem, motion.rows.q[-1], strike.velocity, restitution, limits)
-        strike = replace(strike, follow_through=after)
-        end = f"the path ends at optimum number {k + 1} of {len(solution.optima)}"
-        failure = f"{first or blocked}; {end}" if k else ""
-        moved, note = before.distance(start, here), ""
-        if moved > _NO_MOTION:
-            note = f"the path begins {moved:.2g} (rad, m) from the start, so that the contact is above the surface"
-        return _finished(before, motion, connection.method, limits, failure, note, strike=strike)
-    return blocked or first or "no optimum can be struck"
+        slow = f"the optimum can be struck at {struck.speed:.3g} m/s at most, because of {struck.hindrance}"
+        failure = failure or slow
+    if best is None:
+        return failure or "no optimum can be struck"
+    k, run, method = best
+    after = follow_through(solution.problem, run.motion.rows.q[-1], run.strike.velocity, restitution, limits)
+    failure = f"{failure}; the path ends at optimum number {k + 1} of {len(solution.optima)}" if k else ""
+    strike = replace(run.strike, follow_through=after)
+    return _finished(run.spaces.approach, run.motion, method, limits, failure, strike=strike)
+
+
+def _led(start: Array, run: RunUp, limits: ActuatorLimits, seed: int, effort: int) -> tuple[RunUp, str] | str:
+    """Return a run-up with a motion from the start to it, and the method of the search; or why it has none."""
+    space, motion = run.spaces.approach, run.motion
+    here = run.spaces.begin(start)
+    if here is None:
+        return _fault(space, start)
+    connection = connect(space, here, motion.rows.q[0], seed, effort)
+    if connection.path is None:
+        return "no path leads to the beginning of the run-up"
+    moved, notes = space.distance(start, here), motion.notes
+    if moved > _NO_MOTION:
+        at = "so that the contact is above the surface"
+        notes = (f"the path begins {moved:.2g} (rad, m) from the start, {at}", *notes)
+    if space.length(connection.path) <= _NO_MOTION:
+        return replace(run, motion=replace(motion, notes=notes)), connection.method
+    there = _timed(space, connection.path, limits, seed)
+    if there is None:
+        return _NOT_SMOOTH
+    motion = TimedCurve(there.rows.followed_by(motion.rows), there.method, (*there.notes, *notes))
+    strike = replace(run.strike, run_up_s=float(there.rows.t[-1]), contact_s=float(motion.rows.t[-1]))
+    return replace(run, motion=motion, strike=strike), connection.method
 
 
 def _still(space: PathSpace, q: Array, *reasons: str) -> PosturePath:

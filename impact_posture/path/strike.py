@@ -15,7 +15,7 @@ from impact_posture.path.actuator_limits import ActuatorLimits
 from impact_posture.path.follow_through import FollowThrough
 from impact_posture.path.path_space import PathSpace
 from impact_posture.path.strike_spaces import StrikeSpaces
-from impact_posture.path.stroke import shortest_stroke
+from impact_posture.path.stroke import SHORTEST, shortest_stroke
 from impact_posture.path.timed_curve import TimedCurve, sampled
 from impact_posture.posture.constraints.center_of_mass_over_feet import CenterOfMassOverFeet
 from impact_posture.posture.program.certificate import linearized_limits
@@ -24,8 +24,8 @@ from impact_posture.system.arrays import Array, null_space
 
 # Weight of the squared velocities, relative to their limits, which are added to the largest relative velocity.
 _UNIQUE = 1e-4
-# An inequality or joint limit is active within this distance (m, rad, or the unit of the constraint).
-_ACTIVE = 1e-3
+# Weight of the share of the room that exceeds 1, relative to the largest share of a velocity limit.
+_CROWDED = 100.0
 # A contact velocity that the joints miss by more than this share cannot be reached.
 _MISSED = 1e-9
 # Number of bisections for the greatest speed.
@@ -72,20 +72,19 @@ def check_strike(problem: ConstrainedProblem, speed: float) -> None:
         raise InputError(fault, where="strike", hint=hint)
 
 
-def _leaving(space: PathSpace, q: Array) -> Array:
-    """Return rows ``g``, shape (m, nv), with ``gᵀν ≥ 0`` if a motion with ``ν`` comes from allowed postures to ``q``.
+def _room(space: PathSpace, q: Array) -> tuple[Array, Array]:
+    """Return rows ``g``, shape (m, nv), and distances, shape (m,), such that a step ``δ`` needs ``gᵀδ ≤`` distance.
 
-    A row is the gradient of an inequality or a joint that is at its bound.
+    A row is the gradient of an inequality or joint limit.
     """
     model, problem = space.projector.numeric.at(q), space.problem
     limits = linearized_limits(problem, q)
     bounded = [(limits.value, limits.posture, limits.lower, limits.upper)]
     bounded += [(*c.evaluate(model), c.lower, c.upper) for c in problem.constraints if not c.equality]
-    return np.vstack([
-        rows
-        for value, jacobian, lower, upper in bounded
-        for rows in (jacobian[value > upper - _ACTIVE], -jacobian[value < lower + _ACTIVE])
-    ])  # fmt: skip
+    value, g, lower, upper = (np.concatenate(parts) for parts in zip(*bounded, strict=True))
+    distance = np.concatenate([upper - value, value - lower])
+    # At a posture that violates a bound by a rounding error, the robot can still be at rest.
+    return np.vstack([g, -g])[np.isfinite(distance)], np.maximum(distance[np.isfinite(distance)], 0.0)
 
 
 def _tipping(problem: ConstrainedProblem, model: Numeric) -> Array:
@@ -104,14 +103,14 @@ def _tipping(problem: ConstrainedProblem, model: Numeric) -> Array:
 
 
 def impact_velocity(
-    spaces: StrikeSpaces, q: Array, speed: float, *, balanced: bool = True
+    spaces: StrikeSpaces, q: Array, speed: float, time: float, *, balanced: bool = True
 ) -> tuple[Array, float] | None:
     """Return ``ν`` with ``Jν = −v n`` on the constraints of the run-up, and its largest share of a velocity limit.
 
-    The motion comes from postures within all inequalities and joint limits.  The velocity minimizes the largest of
-    ``|ν_i|/ν̄_i`` and, if ``balanced``, of the shares of :func:`_tipping`, plus a small weight times ``Σ (ν_i/ν̄_i)²``
-    that makes it unique.  Entries without a limit count only in the sum, in rad/s or m/s.  Return ``None`` if no
-    velocity exists.
+    The velocity minimizes the largest of ``|ν_i|/ν̄_i`` and, if ``balanced``, of the shares of :func:`_tipping`, plus
+    a small weight times ``Σ (ν_i/ν̄_i)²`` that makes it unique.  Entries without a limit count only in the sum, in
+    rad/s or m/s.  If possible, ``q − νt`` is within inequalities and joint limits to first order, where ``t`` is the
+    ``time``, s.  If not, the smallest share of ``ν`` does not fit.  Return ``None`` if no velocity exists.
     """
     robot = spaces.run_up.problem.robot
     limited = np.isfinite(robot.velocity_limits)
@@ -122,23 +121,27 @@ def impact_velocity(
     if np.abs(A @ least - b).max() > _MISSED * speed:
         return None
     N = null_space(A, 1e-9)
-    # The unknowns are z and s: ν/ν̄ = least + N z, and all shares are at most s.
-    single, count = np.eye(len(scale))[limited], N.shape[1]
+    # The unknowns are z, s and r: ν/ν̄ = least + N z.  All shares are at most s, and the run-up needs at most r ≥ 1
+    # times the distance to a bound.
+    single = np.eye(len(scale))[limited]
     tipping = _tipping(spaces.run_up.problem, Numeric(robot.model).at(q)) * scale
     shares = np.vstack([single, -single, *([tipping] if balanced else [])])
-    leaving = _leaving(spaces.run_up, q) * scale
-    upper = np.concatenate([-shares @ least, leaving @ least])
+    toward, distance = _room(spaces.run_up, q)
+    rows = np.vstack([shares, -toward * scale, np.zeros(len(scale))])
+    of_share = np.repeat([1.0, 0.0], [len(shares), len(rows) - len(shares)])
+    of_room = np.concatenate([np.zeros(len(shares)), distance / time, [1.0]])
+    upper = -rows @ least - np.append(np.zeros(len(rows) - 1), 1.0)
     x, _, flag, _ = daqp.solve(
-        _UNIQUE * np.eye(count + 1),
-        np.append(np.zeros(count), 1.0),
-        np.column_stack([np.vstack([shares @ N, -leaving @ N]), np.repeat([-1.0, 0.0], [len(shares), len(leaving)])]),
+        _UNIQUE * np.eye(N.shape[1] + 2),
+        np.append(np.zeros(N.shape[1]), [1.0, _CROWDED]),
+        np.column_stack([rows @ N, -of_share, -of_room]),
         upper,
         np.full_like(upper, -1e30),
         np.zeros(len(upper), dtype=np.int32),
     )
     if flag != 1:
         return None
-    relative = least + N @ x[:-1]
+    relative = least + N @ x[:-2]
     return relative * scale, float(np.abs(relative[limited]).max(initial=0.0))
 
 
@@ -163,12 +166,12 @@ def run_up(problem: ConstrainedProblem, q: Array, speed: float, limits: Actuator
     The contact frame turns only if there are too few joints to prevent it.  The capture point of a robot that stands
     stays away from the edges of the feet, unless this bounds the speed.
     """
-    spaces = StrikeSpaces(problem, q)
+    spaces, time = StrikeSpaces(problem, q), SHORTEST[limits.rotors] / 2
     fastest: RunUp | str = "the joints cannot move the contact along the normal"
-    if impact_velocity(spaces, q, speed) is None:
+    if impact_velocity(spaces, q, speed, time) is None:
         spaces = StrikeSpaces(problem, q, turns=True)
     for balanced in (True, False) if problem.requirements.com_over_feet else (False,):
-        impact = impact_velocity(spaces, q, speed, balanced=balanced)
+        impact = impact_velocity(spaces, q, speed, time, balanced=balanced)
         run = fastest if impact is None else _timed_run_up(spaces, q, *impact, speed, limits)
         if isinstance(run, RunUp) and not run.strike.hindrance:
             return run

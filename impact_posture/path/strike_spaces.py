@@ -26,6 +26,8 @@ from impact_posture.system.arrays import Array
 
 # After the impact, the contact point may be this far inside the surface, m, because it may slide along the surface.
 _PRESSED = 1e-4
+# Heights by which a contact point that is inside the surface is lifted before it is pulled onto the constraints, m.
+_HEIGHTS = (0.0, 5e-3, 2e-2)
 _POSES = (HeldPose, HeldPosition, HeldOrientation, AxisInCone)
 # Constraints on a robot at rest, which the limits on the load of a motion replace.
 _AT_REST = (CenterOfMassOverFeet, Holdable, ReachableWrench)
@@ -90,3 +92,15 @@ class StrikeSpaces:
         return lambda model: np.vstack(
             [equality_jacobian(space.problem, model), self.normal @ model.jacobian(self._point)[:3]]
         )
+
+    def begin(self, start: Array) -> Array | None:
+        """Return a posture of ``approach`` near a posture ``start``, shape (nq,); ``None`` if none was reached.
+
+        The surface can be nearer than the contact point at the start, which then has to leave it.
+        """
+        if self.approach.valid(start):
+            return start
+        J = self.approach.projector.numeric.at(start).jacobian(self._point)[:3]
+        steps = (height * np.linalg.pinv(J) @ self.normal for height in _HEIGHTS)
+        pulled = (self.approach.pulled(start, step) for step in steps)
+        return next((q for q in pulled if q is not None), None)

@@ -13,6 +13,7 @@ from impact_posture.path.path_curve import DEVIATION, PathCurve
 from impact_posture.path.path_space import STEP, PathSpace
 from impact_posture.path.time_law import TimeLaw, polynomial, whole
 from impact_posture.path.timed_curve import moment
+from impact_posture.posture.approach.attainable_speed import RUN_UP
 from impact_posture.system.arrays import Array
 
 # Lengths of a stroke, s, measured as the time at the velocity of the impact.  The second length is used if the first
@@ -31,7 +32,7 @@ _DEFLECTED = 0.01
 # Singular values below this share of the largest one are zero.
 _RANK = 1e-9
 # Shortest duration of a stroke, s, which a controller can follow: without rotors, and with rotors, whose thrust lags.
-_SHORTEST = (0.1, 0.2)
+SHORTEST = (RUN_UP, 0.2)
 # Ratio of successive trial durations, and number of bisections between two of them.
 _LONGER, _BISECTIONS = 1.3, 5
 # Number of instants at which a stroke is checked.
@@ -141,7 +142,7 @@ class Stroke:
         def works(duration: float) -> bool:
             return self.need(limits, duration, factor, stop=True).share <= 1
 
-        low = high = min(_SHORTEST[limits.rotors], most)
+        low = high = min(SHORTEST[limits.rotors], most)
         while not works(high):
             if high >= most:
                 return None
@@ -153,7 +154,7 @@ class Stroke:
 
     def hindrance(self, limits: ActuatorLimits, factor: float) -> str:
         """Return what prevents a motion with the velocity ``factor u``: the limit with the least excess, and why."""
-        durations = np.geomspace(min(_SHORTEST[0], self.time / factor), 2 * self.time / factor, 12)
+        durations = np.geomspace(min(SHORTEST[0], self.time / factor), 2 * self.time / factor, 12)
         least = min((self.need(limits, d, factor) for d in durations), key=lambda need: need.share)
         room = f", and the motion cannot be longer because of {self.end}" if self.end else ""
         return least.of + room

@@ -21,7 +21,7 @@ from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.output.report.result_report import result_scene
 from impact_posture.output.result_reader import load_result
 from impact_posture.path.actuator_limits import ActuatorLimits
-from impact_posture.path.follow_through import after_impact, follow_through
+from impact_posture.path.follow_through import _to_edges, after_impact, follow_through
 from impact_posture.path.path_files import read_path, write_path
 from impact_posture.path.posture_path import PosturePath, posture_path
 from impact_posture.path.strike import StrikeSpaces, check_strike, impact_velocity
@@ -143,7 +143,7 @@ def test_velocities_that_leave_an_active_bound_are_preferred() -> None:
     # The run-up comes from q − t ν, which this limit forbids.
     (lower if sign > 0 else upper)[worst] = at[worst]
     blocked = replace(solution.problem, lower=lower, upper=upper)
-    velocity = impact_velocity(StrikeSpaces(blocked, at), at, SPEED)
+    velocity = impact_velocity(StrikeSpaces(blocked, at), at, SPEED, 0.05)
     assert velocity is None or sign * velocity[0][worst] <= 1e-9
 
 
@@ -156,7 +156,7 @@ def test_a_balanced_velocity_keeps_the_capture_point_away_from_the_edges_of_the_
     edges = polygon_edges(foot[:2] for foot in feet)
     assert edges is not None
     for balanced in (True, False):
-        velocity = impact_velocity(StrikeSpaces(problem, q), q, SPEED, balanced=balanced)
+        velocity = impact_velocity(StrikeSpaces(problem, q), q, SPEED, 0.05, balanced=balanced)
         assert velocity is not None
         com, speed = pin.centerOfMass(loaded.model, data, q, velocity[0]), data.vcom[0]
         capture = com + speed * np.sqrt((com[2] - feet[0][2]) / 9.81)
@@ -282,6 +282,30 @@ def test_a_cart_stops_before_the_end_of_its_slide_or_says_why(tmp_path: Path, ef
     assert after.joints is not None and after.joints.distance == pytest.approx(0.1 - 0.3 * duration, abs=2e-3)
     assert (after.joints.of, after.joints.impact[:32]) == ("joint slide", "restitution 0.5, 120% of the spe")
     assert after.clearance is None
+
+
+def test_the_center_of_pressure_follows_from_the_momentum() -> None:
+    """The oracle is the rate of the centroidal momentum, and the distances from lines through pairs of feet."""
+    solution, path = struck("solo8")
+    problem, after, model = solution.problem, path.strike and path.strike.follow_through, solution.problem.robot.model
+    assert after and after.rows and after.center_of_pressure
+    q, data, least = path.q[-1], model.createData(), np.inf
+    pin.framesForwardKinematics(model, data, q)
+    feet = np.array([data.oMf[model.getFrameId(foot.frame)].translation for foot in problem.objective.supports])
+    height, around = feet[:, 2].mean(), feet[np.argsort(np.arctan2(*(feet - feet.mean(axis=0))[:, 1::-1].T)), :2]
+    distance = _to_edges(problem, q, ActuatorLimits(problem.objective, q, problem.requirements))
+    for t in np.linspace(0, after.rows.t[-1], 9):
+        moment = after.rows.at(t)
+        pin.computeCentroidalMomentumTimeVariation(model, data, *moment)
+        force = np.array(data.dhg.linear) + data.mass[0] * 9.81 * np.array([0, 0, 1])
+        arm = np.array(data.com[0]) - height * np.array([0, 0, 1])
+        turn = np.array(data.dhg.angular) + np.cross(arm, force)
+        center = np.array([-turn[1], turn[0]]) / force[2]
+        sides = np.roll(around, -1, axis=0) - around
+        inside = sides[:, 0] * (center - around)[:, 1] - sides[:, 1] * (center - around)[:, 0]
+        assert distance(moment)[0] == pytest.approx((inside / np.linalg.norm(sides, axis=1)).min(), abs=1e-4)
+        least = min(least, distance(moment)[0])
+    assert 0 < after.center_of_pressure.distance <= least + 1e-3
 
 
 def test_an_impact_on_a_tilted_surface_satisfies_the_laws_of_friction() -> None:

@@ -18,8 +18,9 @@ from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import Infeasible, InputError
 from impact_posture.posture.analysis.result_document import result_document
 from impact_posture.posture.approach.approach_speed import ApproachSpeed
-from impact_posture.posture.approach.attainable_speed import AttainableSpeed
+from impact_posture.posture.approach.attainable_speed import _RESERVED, _ROOM, AttainableSpeed
 from impact_posture.posture.formulation.problem_file import Prepared, prepare
+from impact_posture.posture.manifold.feasible_start import feasible_start
 from impact_posture.posture.search.multistart import solve
 from tests.support.command import refused, run
 from tests.support.constraints import check_lifted_rows
@@ -27,17 +28,18 @@ from tests.support.helpers import Vector, rng
 from tests.support.settings import make_settings
 from tests.support.urdfs import MOVED, joint, link, write
 
-# Problems with fixed and standing bases, one and two contacts, a normal in the contact frame, a held joint and a kept
-# frame.
+# Problems with fixed and standing bases, one and two contacts, a normal in the contact frame, a held joint, a kept
+# frame, and room for a run-up.
 PROBLEMS: dict[str, dict[str, object]] = {
     "ur5": {"normal": (0.2, -0.1, 1.0)},
-    "panda": {"normal": (0, 0, 1), "hold": ("panda_joint1",)},
+    "panda": {"normal": (0, 0, 1), "hold": ("panda_joint1",), "strike": True},
     "xarm7": {"normal": (0.3, 0.2, -1), "normal_frame": "contact", "contact_pose": "position"},
     "tiago": {"normal": (-1, 0, 0)},
     "talos": {"frame": "gripper_right_base_link", "normal": (-1, 0, 0), "keep": ("gripper_left_base_link",)},
     "g1": {
         "contact": ("left_rubber_hand:-1,0,0", "right_rubber_hand:-1,0,0"),
         "contact_pose": "position",
+        "strike": True,
     },
 }
 
@@ -98,8 +100,16 @@ def fastest(posed: Prepared, q: Vector) -> float:
         limit[:6] = 0.0
     for name in wanted.hold:
         limit[model.idx_vs[model.getJointId(name)]] = 0.0
+    low, high = -limit, limit
+    if wanted.strike:
+        room = np.maximum(model.upperPositionLimit - q, 0), np.maximum(q - model.lowerPositionLimit, 0)
+        # A floating base does not move.
+        count = nv - 6 if robot.floating else nv
+        still, joints = np.zeros(nv - count), slice(model.nq - count, None)
+        ahead, behind = (np.append(still, side[joints] / _ROOM) for side in room)
+        low, high = np.maximum(-_RESERVED * limit, -ahead), np.minimum(_RESERVED * limit, behind)
     A = np.column_stack([np.array(rows), arrives])
-    bounds = [*((-v, v) if np.isfinite(v) else (None, None) for v in limit), (0, 1e3)]
+    bounds = [*zip(low, high, strict=True), (0, 1e3)]
     optimum = linprog(np.append(np.zeros(nv), -1.0), A_eq=A, b_eq=np.zeros(len(A)), bounds=bounds)
     return float(-optimum.fun)
 
@@ -164,6 +174,21 @@ def test_a_speed_beyond_the_joints_is_infeasible_and_named() -> None:
     posed = prepared("ur5", 20.0)
     with pytest.raises(Infeasible, match="approach at 20 m/s"):
         solve(posed.problem, starts=2, jobs=1)
+
+
+def test_a_strike_beyond_the_joints_gets_the_greatest_speed() -> None:
+    """No posture among random ones is faster, and the optimum needs the required speed."""
+    posed = prepared("ur5", 20.0, strike=True, contact_pose="aligned")
+    solution = solve(posed.problem, starts=2, jobs=1)
+    (required,) = (c for c in solution.problem.constraints if isinstance(c, ApproachSpeed))
+    assert solution.certificate.holds()
+    attainable = AttainableSpeed(posed.problem.robot, posed.problem.objective, posed.problem.requirements)
+    reached = attainable.reached(solution.q)
+    assert reached is not None and required.speed * (1 - 1e-6) <= reached <= 1.01 * required.speed
+    assert any("20 m/s cannot be reached; the greatest speed is " in note for note in solution.notes)
+    drawn = (feasible_start(posed.problem, index, 1) for index in range(40))
+    speeds = [attainable.reached(q) for q in drawn if q is not None]
+    assert len(speeds) > 10 and max(speeds) <= required.speed * 1.002
 
 
 @pytest.mark.parametrize(

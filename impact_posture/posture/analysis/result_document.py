@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+from dataclasses import replace
 from functools import cache
 from importlib import metadata
 from typing import Any
@@ -51,7 +52,8 @@ def result_document(
     evaluations = {name: impact.evaluate(q) for name, q in postures.items()}
     loads = load_cases(impact.objective, solution.initial, prepared.problem.requirements)
     holding = {name: loads.holding(q) for name, q in postures.items()}
-    approach = AttainableSpeed(impact.robot, impact.objective, prepared.problem.requirements)
+    without_run_up = replace(prepared.problem.requirements, strike=False)
+    approach = AttainableSpeed(impact.robot, impact.objective, without_run_up)
     attainable = {name: approach.reached(q) for name, q in postures.items()}
     blocks = {
         name: {
@@ -63,8 +65,8 @@ def result_document(
     }
     # The posture of posture.json, to which the verdict refers.
     answer = list(postures)[-1]
-    struck = [] if path is None or "strike" not in path else [path["strike"]["speed"]]  # type: ignore[index]
-    fastest = min([*struck, *([] if attainable[answer] is None else [attainable[answer]])], default=None)
+    struck = path is not None and "strike" in path
+    fastest = path["strike"]["speed"] if struck else attainable[answer]  # type: ignore[index]
     known = Circumstances(fastest, solution.moved, no_path)
     fault = [solution.compiler_fault] if solution.compiler_fault else []
     at_posture = posture_warnings(prepared, solution.initial, postures[answer], holding[answer], answer)

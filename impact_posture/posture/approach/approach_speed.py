@@ -21,7 +21,11 @@ _PRICE = 1e-3
 class ApproachSpeed(Constraint):
     """``s − σ(q) ≤ 0``: the joints can bring the contact to the surface at the speed s, m/s.
 
-    The joint velocities, divided by their limits, are unknowns of the nonlinear program.
+    The joint velocities, divided by their limits, are unknowns of the nonlinear program.  For a strike, the joints
+    also have room for a run-up (:class:`AttainableSpeed`).
+
+    Attributes:
+        speed: The speed s, m/s.
 
     Raises:
         InputError: There are too few joints to move the contact along the normal.
@@ -35,7 +39,7 @@ class ApproachSpeed(Constraint):
 
     def __init__(self, attainable: AttainableSpeed, speed: float) -> None:
         self.name = f"approach at {speed:g} m/s"
-        self._attainable, self._speed, self._kept = attainable, speed, attainable.independent
+        self._attainable, self.speed, self._kept = attainable, speed, attainable.independent
         if len(self._kept) > len(attainable.free):
             points = " and ".join(point.name for point in attainable.points)
             what = f"{len(attainable.free)} joints cannot move {points} as required"
@@ -47,25 +51,30 @@ class ApproachSpeed(Constraint):
     @property
     def structure(self) -> str:
         attainable = self._attainable
-        parts: list[object] = [self.parameters.shape, self._kept, attainable.moves]
+        parts: list[object] = [self.parameters.shape, self._kept, attainable.moves, attainable.room]
         for moved in attainable.points:
             parts += [moved.point.position, moved.point.rotation, moved.point.joint, moved.rows]
             parts += [moved.comes, moved.in_frame]
         return f"{type(self).__name__}:{digest(*parts)}"
 
+    def slower(self, speed: float) -> ApproachSpeed:
+        """Return the constraint for another speed, m/s, which has the same expressions."""
+        return type(self)(self._attainable, speed)
+
     def describe(self) -> str:
-        return f"{self.name} within the velocity limits of the joints"
+        room = ", with room for a run-up" if self._attainable.roomy.size else ""
+        return f"{self.name} within the velocity limits of the joints{room}"
 
     def evaluate(self, model: Numeric) -> tuple[Array, Array]:
         attained = self._attainable.at(model)
         # If the attainable speed is unbounded, use twice the required speed, so that the row stays finite.
-        speed = attained.speed if np.isfinite(attained.speed) else 2 * self._speed
-        return np.array([self._speed - speed]), -attained.gradient[None, :]
+        speed = attained.speed if np.isfinite(attained.speed) else 2 * self.speed
+        return np.array([self.speed - speed]), -attained.gradient[None, :]
 
     @property
     def lifted_bounds(self) -> tuple[Array, Array]:
-        zero = np.zeros(len(self._kept))
-        return zero, zero
+        attainable, zero = self._attainable, np.zeros(len(self._kept))
+        return np.append(zero, attainable.lowest), np.append(zero, attainable.highest)
 
     def lift(self, tree: Tree, parameters: ca.SX) -> LiftedRows:
         attainable = self._attainable
@@ -78,7 +87,8 @@ class ApproachSpeed(Constraint):
                 axes = ca.reshape(parameters[start : start + 9], 3, 3).T
                 start += 9
             rows.append(moved.symbolic(tree, velocities, axes) + moved.arrives * parameters[0])
-        return LiftedRows(ca.densify(ca.vertcat(*rows)[self._kept]), z)
+        begins = attainable.begins(tree.q, z)
+        return LiftedRows(ca.vertcat(ca.densify(ca.vertcat(*rows)[self._kept]), begins), z)
 
     @property
     def unknowns(self) -> int:
@@ -87,21 +97,32 @@ class ApproachSpeed(Constraint):
     def guess(self, model: Numeric) -> Guess:
         """Return the joint velocities of the fastest approach, scaled down to the required speed."""
         attained, upper = self._attainable.at(model), self._attainable.upper
-        slower = min(1.0, self._speed / min(attained.speed, FASTEST)) if attained.speed > 0 else 1.0
+        slower = min(1.0, self.speed / min(attained.speed, FASTEST)) if attained.speed > 0 else 1.0
         return Guess(slower * attained.velocities, -upper, upper)
 
     def linearize(self, model: Numeric, auxiliaries: Array) -> Linearization:
         """Linearize the rows of :meth:`lift` and the velocity limits."""
-        attainable = self._attainable
+        attainable, nv = self._attainable, model.model.nv
         names = [f"motion of {moved.name} in the {self.name}" for moved in attainable.points for _ in moved.rows]
         by_posture = [attainable.by_posture(model, auxiliaries, row) for row in np.eye(len(names))]
         A, limited = attainable.jacobian(model), np.flatnonzero(np.isfinite(attainable.upper))
         bounds, zero = attainable.upper[limited], np.zeros(len(A))
+        roomy = [attainable.names[k] for k in attainable.roomy]
         return Linearization(
-            [*names, *(f"velocity limit of {attainable.names[k]}" for k in limited)],
-            np.concatenate([A @ auxiliaries + attainable.arrives * self._speed, auxiliaries[limited]]),
-            np.concatenate([zero, -bounds]),
-            np.concatenate([zero, bounds]),
-            np.vstack([np.array(by_posture), np.zeros((len(limited), model.model.nv))]),
-            np.vstack([A, np.eye(len(auxiliaries))[limited]]),
-        )
+            [
+                *names,
+                *(f"joint '{name}' at the begin of the run-up" for name in roomy),
+                *(f"velocity limit of {attainable.names[k]}" for k in limited),
+            ],
+            np.concatenate([
+                A @ auxiliaries + attainable.arrives * self.speed,
+                attainable.begins(model.q, auxiliaries),
+                auxiliaries[limited],
+            ]),
+            np.concatenate([zero, attainable.lowest, -bounds]),
+            np.concatenate([zero, attainable.highest, bounds]),
+            np.vstack([
+                np.array(by_posture), np.eye(nv)[attainable.free[attainable.roomy]], np.zeros((len(limited), nv))
+            ]),
+            np.vstack([A, -attainable.room, np.eye(len(auxiliaries))[limited]]),
+        )  # fmt: skip

@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 
 import casadi as ca
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
+from impact_posture.dynamics.chart import BOUNDED, Chart
 from impact_posture.dynamics.linear_program import solve_linear
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import PointOnLink, Tree
@@ -27,6 +29,13 @@ from impact_posture.system.arrays import Array, independent_rows
 
 # A contact speed (m/s) or velocity limit (rad/s or m/s) of at least this value is treated as unbounded.
 FASTEST = 1e3
+# Shortest duration of a run-up, s, which a controller can follow.
+RUN_UP = 0.1
+# Room of a joint for a run-up, as time at its velocity of the impact, s.  The speed of a run-up rises from rest, so
+# the shortest run-up needs half of its duration.  A tenth is added, because the joint velocities change on the way.
+_ROOM = 1.1 * RUN_UP / 2
+# Share of the velocity limits that the impact of a strike may use, because some joints are faster before the impact.
+_RESERVED = 0.97
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +106,10 @@ class AttainableSpeed:
     feet of a standing robot do not move.  The base of a robot without feet can move at any speed.  A contact whose
     ``contact_pose`` is ``free`` is left out, because there an object hits the robot.
 
+    For a strike (:attr:`Requirements.strike`), the joints also need room for a run-up: ``q_i − ν_i t`` is within the
+    joint limits, where ``t`` is a bit longer than half of the shortest run-up.  A small share of the velocity limits
+    is left to the run-up.
+
     Attributes:
         unknown: Reason why the speed is not computed; empty if it is computed.  A computed speed can still be
             infinite at some postures.
@@ -104,6 +117,8 @@ class AttainableSpeed:
         scale: Unit of each free velocity, rad/s or m/s, shape (k,).
         moves: Map from the free velocities in this unit to ``ν``, which includes followers, shape (nv, k).
         upper: Limit of each free velocity in this unit, shape (k,); infinite if the URDF has no limit.
+        roomy: Indices, in ``free``, of the joints that need room for a run-up, shape (r,).
+        lowest, highest: Position limits of these joints with the margin, rad or m, shape (r,).
     """
 
     def __init__(self, robot: Robot, objective: Objective, requirements: Requirements) -> None:
@@ -117,10 +132,20 @@ class AttainableSpeed:
         free &= ~held_rows(robot, requirements.hold).any(axis=0)
         self.free = np.flatnonzero(free)
         limit = robot.velocity_limits[self.free]
-        stated = limit < FASTEST
-        self.scale, self.upper = np.where(stated, limit, 1.0), np.where(stated, 1.0, np.inf)
+        stated, most = limit < FASTEST, _RESERVED if requirements.strike else 1.0
+        self.scale, self.upper = np.where(stated, limit, 1.0), np.where(stated, most, np.inf)
         self.moves = self._coupling[:, self.free] * self.scale
         self.names = [robot.tangent_names[k] for k in self.free]
+        chart, margin = Chart.of(robot.model), requirements.limit_margin
+        slots = [slot for slot in chart.slots if slot.kind.family in BOUNDED and requirements.strike]
+        in_v, in_q, in_x = (
+            np.array([k for slot in slots for k in range(part(slot).start, part(slot).stop)], dtype=int)
+            for part in (attrgetter("v"), attrgetter("q"), attrgetter("x"))
+        )
+        low, high = (bounds[in_x] for bounds in chart.bounds())
+        roomy = np.isin(in_v, self.free) & (np.isfinite(low) | np.isfinite(high))
+        self.roomy, self._places = np.searchsorted(self.free, in_v[roomy]), in_q[roomy].tolist()
+        self.lowest, self.highest = low[roomy] + margin, high[roomy] - margin
         self.unknown = ""
         if robot.floating and not flies and self.points and ((bringing & standing).any() or not bringing.any()):
             self.unknown = "the legs move the contact, and the speed of such a motion is not computed"
@@ -170,18 +195,39 @@ class AttainableSpeed:
             gradient += model.coupling_gradient(moved.point, moved.wrench(weight), v, in_frame=moved.in_frame)
         return gradient
 
+    def begins(self, q: Array | ca.SX, velocities: Array | ca.SX) -> Array | ca.SX:
+        """Return the positions, rad or m, at which the joints :attr:`roomy` begin a run-up, shape (r,)."""
+        return q[self._places] - self.room @ velocities
+
+    @property
+    def room(self) -> Array:
+        """Map from the free velocities to the room that they need, shape (r, k)."""
+        return np.asarray(_ROOM * np.diag(self.scale)[self.roomy])
+
     def at(self, model: Numeric) -> Attained:
         """Return the fastest approach at ``model.q``."""
         A = np.column_stack([self.jacobian(model), self.arrives])
         rows, cost = np.zeros(len(A)), np.zeros(A.shape[1])
         cost[-1] = -1.0
         high = np.append(self.upper, FASTEST)
-        optimum = solve_linear(cost, A, rows, rows, np.append(-self.upper, 0.0), high)
+        # A joint outside its limits may still move towards them, or be at rest.
+        still = self.begins(model.q, np.zeros(len(self.free)))
+        down, up = np.minimum(self.lowest - still, 0.0), np.maximum(self.highest - still, 0.0)
+        optimum = solve_linear(
+            cost,
+            np.vstack([A, np.column_stack([-self.room, np.zeros(len(self.roomy))])]),
+            np.append(rows, down),
+            np.append(rows, up),
+            np.append(-self.upper, 0.0),
+            high,
+        )
         if optimum is None:
             return Attained(0.0, np.zeros(len(self.free)), np.zeros(model.model.nv))
         if -optimum.value > (1 - 1e-9) * FASTEST:
             return Attained(float("inf"), optimum.x[:-1], np.zeros(model.model.nv))
-        gradient = -self.by_posture(model, optimum.x[:-1], optimum.multipliers)
+        gradient = -self.by_posture(model, optimum.x[:-1], optimum.multipliers[: len(A)])
+        of_room = optimum.multipliers[len(A) :]
+        gradient[self.free[self.roomy]] -= np.where(np.where(of_room > 0, up, down) != 0, of_room, 0.0)
         return Attained(max(0.0, -optimum.value), optimum.x[:-1], gradient)
 
     def reached(self, q: Array) -> float | None:

@@ -44,6 +44,8 @@ class Requirements:
             requirement.
         approach_asked: Whether the user gave the setting ``approach``.  If not, and the attainable speed cannot be
             computed, the requirement is dropped without a note.
+        strike: Whether the contact point arrives at the approach speed after a run-up.  If no posture allows this
+            speed, the greatest possible speed is required instead.
         collision: Whether the links must not touch each other, the surface, the ground or the obstacles.
         clearance: Least distance between links, surface, ground and obstacles if ``collision`` is set, m.
         surface: Shape of the surface: ``plane``, ``none``, or the edge length of a square patch, m; if ``None``, the
@@ -73,6 +75,7 @@ class Requirements:
     largest_jump: float = float("inf")
     approach_speed: float = 0.0
     approach_asked: bool = True
+    strike: bool = False
     collision: bool = False
     clearance: float = CLEARANCE
     surface: str | float | None = None

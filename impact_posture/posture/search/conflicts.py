@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain, islice
 
 import casadi as ca
@@ -83,7 +83,7 @@ def find_conflicts(
         if not best.conflicts or (count == _CONFIRMING and 2 * best.violation >= beside > 0):
             break
     assert best is not None  # noqa: S101 (narrows a type)
-    return best
+    return replace(best, problem=problem)
 
 
 def _starts(problem: ConstrainedProblem, chart: Chart, seed: int) -> Iterator[Array]:

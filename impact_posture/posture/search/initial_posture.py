@@ -7,23 +7,28 @@ from dataclasses import replace
 import numpy as np
 
 from impact_posture.errors import ContactError, ImpactPostureError, Infeasible, SolverFailed
+from impact_posture.posture.approach.approach_speed import ApproachSpeed
 from impact_posture.posture.formulation.build_problem import build_problem
 from impact_posture.posture.manifold.feasible_start import FEASIBLE, Projector, feasible_start
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem
 from impact_posture.posture.program.program_rows import ProgramRows
-from impact_posture.posture.search.conflicts import ElasticProgram, find_conflicts
+from impact_posture.posture.search.conflicts import ElasticProgram, LeastViolation, find_conflicts
 from impact_posture.posture.search.growing_search import feasible
 from impact_posture.system.arrays import Array
 
 # If ``beside`` has this small value, :func:`find_conflicts` stops after a few starts when a conflict remains.
 _QUICK = 1e-9
+# If no posture allows the speed of a strike, the required speed is below the greatest speed by this share, so that
+# the program has an interior.  A greatest speed below the second share of the stated speed is a conflict.
+_SLOWER, _LEAST_SPEED = 1e-3, 0.01
 
 
 def initial_posture(problem: ConstrainedProblem, seed: int, rows: ProgramRows) -> tuple[ConstrainedProblem, Array]:
     """Return the given posture moved onto the constraints, or else the first random start that reaches them.
 
     If the start still violates constraints that the projection ignores, the elastic program moves the start.  The
-    returned problem then has all parts that the elastic program needed.
+    returned problem then has all parts that the elastic program needed.  If no posture allows the speed of a strike,
+    the returned problem requires the greatest possible speed instead.
 
     Raises:
         Infeasible: No posture satisfies the constraints; the error names the conflicting constraints.
@@ -35,6 +40,7 @@ def initial_posture(problem: ConstrainedProblem, seed: int, rows: ProgramRows) -
         return problem, start
     given, problem = problem.given, problem if start is None else replace(problem, given=start)
     least = find_conflicts(problem, seed, ElasticProgram(problem, rows))
+    least = _slowed(least) if problem.requirements.strike else least
     if least.conflicts:
         limits = f"; there {', '.join(least.at_limits[:4])}" if least.at_limits else ""
         sign = "; check the sign of the normal, which points towards the robot, and how far the `surface` reaches"
@@ -53,6 +59,21 @@ def initial_posture(problem: ConstrainedProblem, seed: int, rows: ProgramRows) -
         fault = f"no known posture satisfies the constraints; the nearest misses them by {projection.violation:.1e}"
         raise SolverFailed(fault, where="problem", hint="start from a `posture` nearer to the target")
     return replace(least.problem, given=given), projection.q
+
+
+def _slowed(least: LeastViolation) -> LeastViolation:
+    """Return the problem with the greatest approach speed of the search if only the approach speed conflicts."""
+    (approach,) = [c for c in least.problem.constraints if isinstance(c, ApproachSpeed)] or (None,)
+    if approach is None or least.conflicts.keys() != {approach.name}:
+        return least
+    greatest = approach.speed - least.conflicts[approach.name]
+    if greatest <= _LEAST_SPEED * approach.speed:
+        return least
+    slower = approach.slower((1 - _SLOWER) * greatest)
+    constraints = tuple(slower if c is approach else c for c in least.problem.constraints)
+    note = f"{approach.speed:g} m/s cannot be reached; the greatest speed is {greatest:.3g} m/s"
+    notes = (*least.problem.notes, note)
+    return replace(least, problem=replace(least.problem, constraints=constraints, notes=notes), conflicts={})
 
 
 def _turn_hint(problem: ConstrainedProblem, seed: int) -> str:
