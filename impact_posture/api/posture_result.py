@@ -278,9 +278,9 @@ def optimize(
 
     Args:
         problem: The problem.
-        starts: Largest number of random postures that the search screens, by default 6144.  For the search
-            ``multistart`` and for problems that cannot be screened, the number of starts, by default 16.  Then the
-            first start is the given posture, and the others are random feasible postures.
+        starts: Largest number of random postures that the search screens, by default 6144.  If the search is
+            ``multistart``, or the problem cannot be screened, it is the number of starts, by default 16.  The first
+            start is then the given posture, and the others are random feasible postures.
         seed: Seed of the random starts.
         jobs: Number of parallel processes.
         compile: When to compile the program: ``auto`` (if it saves time), ``always`` or ``never``.

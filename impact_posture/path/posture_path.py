@@ -29,7 +29,8 @@ _NOT_SMOOTH = "no smooth curve through the path satisfies the constraints"
 _OPTIMA = 5
 # An optimum with a larger objective is struck instead if its speed exceeds the greatest speed so far by this factor.
 _FASTER = 1.02
-# A path below this tangent length counts as no motion.  A relative gain below the second value counts as no gain.
+# A path below the tangent length ``_NO_MOTION`` counts as no motion.  A relative gain below ``_NO_GAIN`` counts as no
+# gain.
 _NO_MOTION, _NO_GAIN = 1e-6, 1e-6
 # Largest number of reached postures to evaluate if no optimum is reached.
 _MOST_VISITED = 400

@@ -116,7 +116,7 @@ def check_mass_matrix(robot: Robot, where: str) -> None:
         values, vectors = np.linalg.eigh(M * np.outer(scale, scale))
         if values[0] >= _SINGULAR * values[-1]:
             return
-        # Eigenvector in joint velocities: the motion that meets no inertia.
+        # The eigenvector of the least eigenvalue, scaled to joint velocities, is the motion that meets no inertia.
         motion = np.abs(scale * vectors[:, 0])
         free = motion >= 0.1 * motion.max()
     names = [name for name, moves in zip(robot.tangent_names, moving, strict=True) if moves]

@@ -66,7 +66,7 @@ def dask_cluster(address: str) -> Iterator[Executor]:
 
 @contextmanager
 def _unlogged(*names: str) -> Iterator[None]:
-    """Log no messages of other packages, because errors of their executors are raised, too."""
+    """Hide the log messages of other packages, because the errors in these messages are also raised."""
     loggers = [logging.getLogger(name) for name in names]
     levels = [logger.level for logger in loggers]
     for logger in loggers:

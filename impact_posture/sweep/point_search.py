@@ -23,8 +23,8 @@ from impact_posture.posture.search.growing_search import HIGH_PRICE
 from impact_posture.posture.search.multistart import distinct, solve
 from impact_posture.system.arrays import Array
 
-# Maximum number of rounds that add missing body pairs to the nonlinear program of a point.  The second number applies
-# as long as it is unknown whether the point is feasible.
+# Maximum number of rounds that add missing body pairs to the nonlinear program of a point.  ``_UNSURE`` applies as
+# long as it is unknown whether the point is feasible.
 _ROUNDS, _UNSURE = 8, 3
 # Postures whose joints differ by more than this (rad, m) may belong to different optima.
 SWITCH = 0.2

@@ -26,9 +26,9 @@ _ROWS = 1e-3
 # A pair is added to the program if it violates its clearance by more than this value, m.  The value is half the
 # tolerance of the certificate.
 _MISSING = 5e-9
-# Largest number of pairs that one posture adds to the program.  Pairs with the deepest penetration come first.  The
-# first number is for pairs of links, the second for pairs of a link and a plane.  Links behind a plane are mostly
-# neighbors, so moving the deepest link out also moves the other links.
+# Largest number of pairs that one posture adds to the program.  Pairs with the deepest penetration come first.
+# ``_MOST`` is for pairs of links, and ``_MOST_BEHIND`` for pairs of a link and a plane.  Links behind a plane are
+# mostly neighbors, so moving the deepest link out also moves the other links.
 _MOST, _MOST_BEHIND = 6, 2
 
 _Lifted = WeakKeyDictionary[Tree, dict[int, tuple[Corners, LiftedRows]]]

@@ -37,7 +37,7 @@ _REPLACED_BY = {
     "contact_stiffness": ("contact_duration",),
     "posture": ("q",),
 }
-# Fields of Requirements that depend on the robot and on the setting with the same name.
+# Fields of Requirements whose values follow from the robot and from the setting with the same name.
 _WORKED_OUT = {"contact_pose", "base", "hold", "com_margin", "limit_margin"}
 
 

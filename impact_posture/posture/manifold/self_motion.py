@@ -87,7 +87,7 @@ class SelfMotion:
 def map_self_motion(
     manifold: ConstraintManifold, dimension: int, known: Array, *, patience: int = 1000, seed: int = 0
 ) -> SelfMotion:
-    """Map each component that a random start reaches, until ``patience`` starts in a row reach no new one.
+    """Map the components that random starts reach, until ``patience`` starts in a row reach no new component.
 
     The components that contain the postures ``known``, shape (N, nx), are mapped first.
 

@@ -26,7 +26,7 @@ _SLACK_PRICE = 0.03
 # Price of the squared distance from the given posture.  This term makes the solution unique.
 _AWAY_PRICE = 1e-6
 # Maximum number of starts, and of random postures from which the starts are chosen. Starts far from all bodies often
-# lead to a feasible posture when 24 arbitrary ones do not.
+# lead to a feasible posture when 24 arbitrary starts do not.
 _TRIES, _DRAWN = 24, 200
 # Number of starts that confirm a conflict known from a nearby target. For panda in front of a wall, two starts are
 # needed to find a way around a body.

@@ -32,10 +32,10 @@ _ROUNDS = 10
 # If all starts together have at most this many unknowns, every start is finished, because stopping some would save no
 # time.
 _SMALL = 1000
-# Used unless all starts are finished.  The first number limits the unknowns of all starts that continue together; the
-# second is the least number of these starts.  A start is dominated if its objective exceeds the best by the third
-# number, a share.  If more starts continued together, the program would get parts that the best starts do not need.
-# If fewer starts continued together, the program would be built more often.  The share is large because a run after a
+# Used unless all starts are finished.  ``_BATCH`` limits the unknowns of all starts that continue together;
+# ``_LEAST`` is the least number of these starts.  A start is dominated if its objective exceeds the best by the share
+# ``_FAR``.  If more starts continued together, the program would get parts that the best starts do not need.  If
+# fewer starts continued together, the program would be built more often.  ``_FAR`` is large because a run after a
 # trap may end below the bound of its start.
 _BATCH, _LEAST, _FAR = 600, 2, 0.05
 # Starting processes takes as long as runs with this many unknowns in total.

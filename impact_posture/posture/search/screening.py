@@ -29,8 +29,8 @@ from impact_posture.system.arrays import Array
 # begin, the search does not wait for the slowest descents (at most the share ``_SLOWEST`` of the ended descents),
 # because a small batch takes nearly as long as a large one.
 _WIDTH, _SLOWEST = 512, 1 / 16
-# The number of descents, times the fourth power of the degrees of freedom, is limited by the first number, because
-# descents of large robots take longer.  At least the second number is allowed.
+# ``_WORK`` limits the number of descents times the fourth power of the degrees of freedom, because descents of large
+# robots take longer.  At least ``_LEAST`` descents are allowed.
 _WORK, _LEAST = 40_000_000, 16
 # If less than the share ``_REACHED`` of the first random postures reaches the equalities, their ends differ too
 # little.  Then ``_FEASIBLE`` starts that satisfy all constraints descend too, but at most the share ``_PART`` of all
@@ -41,8 +41,8 @@ _HOPPING = 0.75
 # A hop starts at an optimum with a probability proportional to ``(1 + rank)^-_RANKED / (1 + hops / _TIRED)²``.  The
 # best optimum has the rank 0, and ``hops`` counts the earlier hops from this optimum.
 _RANKED, _TIRED = 0.7, 8
-# A hop gives other values to one of these shares of the joints, rounded up.  The second number is the share of hops
-# that take these values from another optimum; the other hops draw random values.
+# A hop gives other values to one of the shares ``_REDRAWN`` of the joints, rounded up.  The share ``_CROSSED`` of all
+# hops takes these values from another optimum; the other hops draw random values.
 _REDRAWN, _CROSSED = (0.1, 0.2, 0.3, 0.5), 0.6
 # Distance (rad, m) below which two ends are the same optimum if their merits differ by less than SAME_VALUE.
 _SAME = 0.05
@@ -67,7 +67,7 @@ class Screening:
         guesses: Postures from which IPOPT starts, shape (nq,) each.
         hits: Number of random postures that descended to each guess.
         values: For each distinct objective where descents ended, best first: the number of random postures that
-            descended to it.  The last values are ones, each for a random posture whose descent got stuck.
+            descended to it.  The last entries are 1, each for a random posture whose descent got stuck.
         partial: Whether the problem has constraints that descents ignore, such as clearances.
         hops: Number of hops.
     """
