@@ -1,6 +1,7 @@
 """``impact-posture codegen ROBOT --frame F --normal X Y Z`` or ``impact-posture codegen RESULT_DIR``.
 
-With ``--controller KIND``, the command writes the complete online controller instead of the metric alone.
+With ``--controller KIND``, the command writes the complete online controller instead of the metric alone.  From a
+result with a path, it also writes the references along the path.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from impact_posture.controller_export.export_controller import ControllerExport
     from impact_posture.impact.elasticity.contact_compression import Compression
     from impact_posture.impact.worst_case_objective import WorstCaseObjective
+    from impact_posture.path.posture_path import PosturePath
     from impact_posture.robot.robot import Robot
     from impact_posture.system.arrays import Array
     from impact_posture.tsid.task_formulation import TaskFormulation
@@ -47,7 +49,8 @@ def codegen(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    from_result = typed.is_result(robot, {"prefix", "out", "float_", "portable", "cuda", "compile", "force"})
+    free = {"prefix", "out", "float_", "portable", "cuda", "compile", "controller", "flow", "daqp", "force"}
+    from_result = typed.is_result(robot, free)
     if controller is None:
         if flow or scenario is not None or daqp is not None:
             what = "--flow, --scenario and --daqp belong to --controller"
@@ -62,15 +65,20 @@ def codegen(
     if controller is not None:
         from impact_posture.controller_export.export_controller import export_controller
 
-        made, formulation, objective = _controller_parts(typed, robot, controller, flow, scenario)
+        made, formulation, objective, motion = (
+            _result_parts(robot, controller, flow)
+            if from_result
+            else (*_controller_parts(typed, robot, controller, flow, scenario), None)
+        )
         written = export_controller(
             made, formulation, place, objective=objective, prefix=prefix, daqp=daqp,
-            build=compile, force=force,
+            build=compile, force=force, path=motion,
         )  # fmt: skip
         posture = "nominal posture" if objective is None else "reference flow" if flow else "impact-robust"
         title = f"{made.name}, {controller}", posture
         tasks = ", ".join(task["name"] for task in written.manifest["tasks"])
         rows = [("tasks", tasks), ("header", f"{written.prefix}.h")]
+        rows += [("path", f"{written.prefix}_path.h")] if motion is not None else []
     else:
         from impact_posture.codegen.export import write_export
 
@@ -130,6 +138,23 @@ def _objectives(
     known = (compression(one.objective, one.q, one.speed, one.contact_stiffness) for one in impacts)
     last = impacts[-1]
     return [one.objective for one in impacts], None, next(filter(None, known), None), last.warnings, last.choice
+
+
+def _result_parts(
+    folder: str, kind: ControllerKind, flow: bool
+) -> tuple[Robot, TaskFormulation, WorstCaseObjective, PosturePath | None]:
+    """Return the robot of a result, its task formulation, its objective, and the path that its controller follows.
+
+    With a reference flow, or if the robot stays at its start, there is no path to follow.
+    """
+    from impact_posture.controller_export.default_formulation import default_formulation
+    from impact_posture.output.result_reader import load_view
+
+    view = load_view(Path(folder))
+    objective, motion = view.objective, view.motion
+    formulation = default_formulation(objective.robot, kind, objective, flow=flow)
+    moves = motion is not None and len(motion.t) > 1 and not flow
+    return objective.robot, formulation, objective, motion if moves else None
 
 
 def _controller_parts(

@@ -26,6 +26,8 @@ from impact_posture.system.libraries import library_path, load_library
 from impact_posture.tsid.controller import Command, Report
 
 _FUNCTIONS = ("init", "reset", "tick", "last_report", "move_to", "lead_posture", "brace", "contact", "release")
+# Functions that controllers with a reference flow have, and that controllers of earlier versions lack.
+_OPTIONAL = ("brace_before", "lead")
 # Number of doubles in a target: 1 (whether it is set), 3 (position), 9 (rotation), 6 (velocity), 6 (acceleration).
 TARGET = 25
 
@@ -65,7 +67,7 @@ class CompiledController:
         self.targets = {task.name: row for task, row in zip(manifest.tasks, targets, strict=True)}
         self._q, self._v, self._force = np.zeros(manifest.nq), np.zeros(manifest.nv), np.zeros(6)
         self._pointers = [_pointer(x) for x in (self._q, self._v, self._force)]
-        names = (*_FUNCTIONS, *(["brace_before"] if sizes.get("FLOW") else []))
+        names = (*_FUNCTIONS, *(name for name in _OPTIONAL if hasattr(library, f"{prefix}_{name}")))
         self._functions = {name: getattr(library, f"{prefix}_{name}") for name in names}
         getattr(library, f"{prefix}_default_params")(ctypes.byref(self._given))
         self._ready = False
@@ -236,10 +238,22 @@ class CompiledController:
             InputError: A number is invalid, or ``reset`` has not been called.
             ValueError: The shape of an array is wrong.
         """
+        self._lead("lead_posture", q, v, a)
+
+    def lead(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> None:
+        """Do the same as :meth:`lead_posture`, and set all other targets to their outputs in the same motion.
+
+        Errors are as in :meth:`lead_posture`.
+        """
+        self._lead("lead", q, v, a)
+
+    def _lead(self, function: str, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> None:
         n, nv = self._q.shape, self._v.shape
         arrays = [_shaped(q, n, "q"), _shaped(v, nv, "v"), _shaped(a, nv, "a")]
-        if self._call("lead_posture", *map(_pointer, arrays)):
-            raise InputError("a number is invalid", where="lead_posture", hint="give a posture and finite numbers")
+        if function not in self._functions:
+            raise InputError("the controller has no such function", where=function, hint="run codegen again")
+        if self._call(function, *map(_pointer, arrays)):
+            raise InputError("a number is invalid", where=function, hint="give a posture and finite numbers")
 
     @property
     def target(self) -> Array:

@@ -33,9 +33,10 @@ from impact_posture.version import __version__
 
 # Files of the folder c/, in the order in which they are joined.
 _CORE = (
-    "vector.c", "eigen.c", "algebra.c", "tasks.c", "contacts.c", "qp.c", "rank.c", "solve.c", "give_way.c",
-    "reference_flow_space.c", "reference_flow_limits.c", "reference_flow_zmp.c", "reference_flow_direction.c",
-    "reference_flow.c", "reference_flow_motion.c", "posture.c", "init.c", "tick.c", "report.c",
+    "vector.c", "eigen.c", "manifold.c", "algebra.c", "tasks.c", "contacts.c", "qp.c", "rank.c", "solve.c",
+    "give_way.c", "reference_flow_space.c", "reference_flow_limits.c", "reference_flow_zmp.c",
+    "reference_flow_direction.c", "reference_flow.c", "reference_flow_motion.c", "posture.c", "init.c", "tick.c",
+    "report.c",
 )  # fmt: skip
 _RELAXATION = (
     "relaxation_memory.c", "vector.c", "relaxation_rows.c", "relaxation_elimination.c", "relaxation_level.c",
@@ -161,9 +162,9 @@ def render(
     room = {name: max(1, value) for name, value in (sizes | more).items()}
     n += 1
     solver = 8 * (n * (n + 1) // 2 + 12 * n + 2 * max(bounds, 2 * rows)) + 2048
-    tables = [(name, *_table(values)) for name, values in s.tables.items()]
-    tables.append(("gravity", *_table(np.array(robot.model.gravity.linear, dtype=float))))
-    tables.append(("allocation", *_table(s.actuators.G[: sizes["BASE"], : sizes["ROTORS"]])))
+    tables = [(name, *table(values)) for name, values in s.tables.items()]
+    tables.append(("gravity", *table(np.array(robot.model.gravity.linear, dtype=float))))
+    tables.append(("allocation", *table(s.actuators.G[: sizes["BASE"], : sizes["ROTORS"]])))
     named_fields = [(field.name, k) for k, field in enumerate(fields, 1) if field.name in _NAMED]
     context: dict[str, Any] = {
         "robot": robot.name, "version": __version__, "prefix": prefix, "sizes": sizes, "room": room, "fields": fields,
@@ -173,7 +174,7 @@ def render(
         "stack_bytes": -(-max(code.stack_bytes, solver + 16 * nv * 8) // 64) * 64 + _FRAMES,
         "identity": identity, "tables": tables, "named": named_fields, "literals": _initializer,
         "rules": _braced(str(x) for f in fields for x in (f.value.size, RULES[f.rule])),
-        "core": "\n".join(_core_text(name) for name in _files(sizes)),
+        "core": "\n".join(core_text(name) for name in _files(sizes)),
     }  # fmt: skip
     templates = environment("impact_posture.controller_export", c_comment)
     files = [
@@ -212,8 +213,8 @@ def _relaxation_room(n: int, m: int, levels: int) -> int:
 def relaxation() -> dict[str, str]:
     """Return file name → text of the relaxation, whose C names have no prefix yet."""
     return {
-        "relaxation.h": _core_text("relaxation.h"),
-        "relaxation.c": "\n".join(_core_text(name) for name in _RELAXATION),
+        "relaxation.h": core_text("relaxation.h"),
+        "relaxation.c": "\n".join(core_text(name) for name in _RELAXATION),
     }
 
 
@@ -223,7 +224,8 @@ def named(text: str, prefix: str) -> str:
     return re.sub(r"\bip_", f"{prefix}_", re.sub(r"\bIP_", f"{prefix.upper()}_", text))
 
 
-def _core_text(name: str) -> str:
+def core_text(name: str) -> str:
+    """Return the text of a file in the folder ``c/``."""
     return (resources.files(__package__) / "c" / name).read_text(encoding="utf-8")
 
 
@@ -235,7 +237,7 @@ def _initializer(values: Array) -> str:
     return _braced(c_double(float(x)).strip("()") for x in values)
 
 
-def _table(values: Array) -> tuple[str, str, str]:
+def table(values: Array) -> tuple[str, str, str]:
     """Return the C type of a table, its length, and its initializer; an empty table gets one zero."""
     values = values.ravel() if values.size else np.zeros(1, dtype=values.dtype)
     if values.dtype == np.int64:

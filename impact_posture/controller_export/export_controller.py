@@ -23,9 +23,11 @@ from impact_posture.controller_export.controller_parameters import Field, parame
 from impact_posture.controller_export.controller_source import render
 from impact_posture.controller_export.controller_structure import Structure, structure_of
 from impact_posture.controller_export.daqp_sources import FILES, VERSION, daqp_sources, renamed
+from impact_posture.controller_export.path_source import path_reference, render_path
 from impact_posture.dynamics.model_parameters import ModelParameters
 from impact_posture.errors import InputError
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.path.posture_path import PosturePath
 from impact_posture.robot.robot import Robot
 from impact_posture.system.libraries import library_path
 from impact_posture.system.output_folder import whole_folder, write_whole
@@ -79,6 +81,7 @@ def export_controller(
     force: bool = False,
     generated: Sequence[str] = (),
     shared: bool = False,
+    path: PosturePath | None = None,
 ) -> ControllerExport:
     """Write the controller of a formulation as C99 code to a folder, completely or not at all.
 
@@ -98,9 +101,12 @@ def export_controller(
         generated: Additional compiler flags for the sources that are generated from the model.
         shared: Make armature and joint placements a parameter, ``numbers``, so that robots that differ only in these
             numbers share the code.  The code then contains the gradient.
+        path: Path whose references (:class:`~impact_posture.path.path_reference.PathReference`) the folder contains
+            as well, with an example.  If the path strikes, its contact must be the contact of ``objective``.
 
     Raises:
-        InputError: A task or joint has no C code, or the gradient or the sources of DAQP are missing.
+        InputError: A task or joint has no C code, the gradient or the sources of DAQP are missing, or the path does
+            not fit the controller.
         OutputError: The folder exists and ``force`` is false, is not an export, or cannot be written.
         CompilerError: The compiler failed.
     """
@@ -110,6 +116,7 @@ def export_controller(
         what = "the posture task has no objective" if objective is None else "no task uses the objective"
         hint = "give the objective of its gradient" if objective is None else "give a posture task that follows one"
         raise InputError(what, where="controller export", hint=hint)
+    along = {} if path is None else render_path(structure, path_reference(robot, path, objective), prefix)
     sources = daqp_sources(Path(daqp) if daqp else None)
     fields = tuple(parameters(structure, period))
     if shared:
@@ -117,11 +124,12 @@ def export_controller(
         fields = (*fields, Field("numbers", "finite", "armature and placements of the joints", numbers))
     manifest = _manifest(structure, fields, prefix)
     metric = f"{prefix}_metric" if objective is not None else None
-    parts = ("defaults", "dynamics", "relaxation", *([] if metric is None else ["metric"]), "daqp")
+    more = [name for name, exists in (("metric", objective), ("path", path)) if exists is not None]
+    parts = ("defaults", "dynamics", "relaxation", *more, "daqp")
     manifest["sources"] = [f"{prefix}_{name}.c" for name in parts]
     lean = objective if shared else None
     texts = render(structure, fields, prefix, identity(manifest), metric, lean, shared=shared)
-    texts |= renamed(sources, prefix)
+    texts |= renamed(sources, prefix) | along
     texts[f"{prefix}.json"] = json.dumps(manifest, indent=2, allow_nan=False) + "\n"
     texts |= {} if objective is None or metric is None or shared else _metric(objective, metric)
     texts["Makefile"], texts["CMakeLists.txt"] = _makefile(manifest), _cmake(manifest)

@@ -43,19 +43,28 @@ class RowInterpolation:
         rows = (np.vstack([getattr(self, key), getattr(other, key)[1:]]) for key in ("q", "v", "a"))
         return RowInterpolation(self.model, t, *rows)
 
-    def at(self, t: float) -> Moment:
-        """Return posture, velocity and acceleration at time ``t``, which is limited to the times of the rows."""
-        k = int(np.clip(np.searchsorted(self.t, t, side="right") - 1, 0, len(self.t) - 2))
+    def coefficients(self, k: int) -> Array:
+        """Return the coefficients of ``u``, …, ``u⁵`` between rows ``k`` and ``k + 1``, shape (5, nv).
+
+        The polynomial gives the tangent coordinates at row ``k``, and ``u`` rises from 0 to 1.
+        """
         start, end, h = self.q[k], self.q[k + 1], self.t[k + 1] - self.t[k]
-        u = float(np.clip((t - self.t[k]) / h, 0.0, 1.0))
         turn = pin.dDifference(self.model, start, end, pin.ARG1)
         # Ignore the change of this matrix, which is of second order in the step, and zero for joints of one axis.
         v, a = self.v[k] * h, self.a[k] * h**2
         gap = np.array(pin.difference(self.model, start, end)) - v - a / 2
         speed, bend = h * (turn @ self.v[k + 1]) - v - a, h**2 * (turn @ self.a[k + 1]) - a
-        c = [10 * gap - 4 * speed + bend / 2, -15 * gap + 7 * speed - bend, 6 * gap - 3 * speed + bend / 2]
-        z = u * (v + u * (a / 2 + u * (c[0] + u * (c[1] + u * c[2]))))
-        dz = v + u * (a + u * (3 * c[0] + u * (4 * c[1] + u * 5 * c[2])))
-        ddz = a + u * (6 * c[0] + u * (12 * c[1] + u * 20 * c[2]))
+        high = 10 * gap - 4 * speed + bend / 2, -15 * gap + 7 * speed - bend, 6 * gap - 3 * speed + bend / 2
+        return np.array([v, a / 2, *high])
+
+    def at(self, t: float) -> Moment:
+        """Return posture, velocity and acceleration at time ``t``, which is limited to the times of the rows."""
+        k = int(np.clip(np.searchsorted(self.t, t, side="right") - 1, 0, len(self.t) - 2))
+        start, h = self.q[k], self.t[k + 1] - self.t[k]
+        u = float(np.clip((t - self.t[k]) / h, 0.0, 1.0))
+        c = self.coefficients(k)
+        z = u * (c[0] + u * (c[1] + u * (c[2] + u * (c[3] + u * c[4]))))
+        dz = c[0] + u * (2 * c[1] + u * (3 * c[2] + u * (4 * c[3] + u * 5 * c[4])))
+        ddz = 2 * c[1] + u * (6 * c[2] + u * (12 * c[3] + u * 20 * c[4]))
         back = pin.dIntegrate(self.model, start, z, pin.ARG1)
         return np.array(pin.integrate(self.model, start, z)), back @ dz / h, back @ ddz / h**2

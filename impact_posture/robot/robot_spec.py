@@ -171,6 +171,11 @@ class PropulsionSpec(_Table):
     rotors: tuple[RotorSpec, ...]
     source: str = ""
 
+    @property
+    def lag(self) -> float:
+        """Mean time constant of the rotors, s."""
+        return (self.time_constant_up + self.time_constant_down) / 2
+
 
 @dataclass(frozen=True)
 class RobotSpec(_Table):

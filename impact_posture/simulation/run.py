@@ -91,7 +91,7 @@ def run(factory: ControllerFactory, controller: str, *, seed: int = 0, mode: Mod
 
 
 class _Loop:
-    """Loop of controller and world, in C if both have C code, otherwise in Python."""
+    """Loop of controller and world, in C if both have C code and no posture moves, otherwise in Python."""
 
     def __init__(self, factory: ControllerFactory, driver: Driver, seed: int) -> None:
         setup = factory.setup
@@ -104,7 +104,9 @@ class _Loop:
             raise InputError(what, where=setup.scenario.source, hint="change control.period or physics.timestep")
         command = driver.reset(setup.q)
         self.world.reset(setup.q, seed=seed, rotor_speed=command.rotor_speed)
-        self.compiled = compiled_world(self.world, driver.compiled, self.count)
+        # The loop in C knows its targets before the first tick, and no references of the posture task.
+        in_c = None if driver.leads_posture else driver.compiled
+        self.compiled = compiled_world(self.world, in_c, self.count)
         self.recorder = Recorder(setup, factory.metric)
         self.away: float | None = None
 

@@ -9,14 +9,16 @@ from impact_posture.config.checked import checked
 from impact_posture.config.demand import Positive
 from impact_posture.errors import InputError
 from impact_posture.robot.robot import Robot
+from impact_posture.system.arrays import Array
 from impact_posture.tsid.limits.acceleration_bounds import LimitLaw
 from impact_posture.tsid.limits.impact_limits import ImpactLimits
 from impact_posture.tsid.point_kinematics import Point
+from impact_posture.tsid.state import State
 from impact_posture.tsid.support_contact import SupportContact, support_contacts
 from impact_posture.tsid.tasks.body_tasks import BaseOrientation, CenterOfMass, Tilt
 from impact_posture.tsid.tasks.frame_tasks import EndEffector, FramePose
 from impact_posture.tsid.tasks.joint_posture import JointPosture
-from impact_posture.tsid.tasks.task import Task
+from impact_posture.tsid.tasks.task import TargetTask, Task
 
 Order = Literal["strict", "weighted"]
 # Default stiffness of the end effector's task, 1/s².
@@ -73,6 +75,19 @@ class TaskFormulation:
         points = [c.point for c in self.contacts] + [p for task in self.tasks for p in task.points]
         points += [p for limit in self.row_limits for p in limit.points]
         return tuple(dict.fromkeys(points if self.force_point is None else [*points, self.force_point]))
+
+    def lead(self, state: State, a: Array) -> None:
+        """Move the targets of all tasks along a motion, at ``q`` and ``ν`` of ``state`` and ``ν̇`` = ``a``, (nv,).
+
+        A target becomes the output of its task, with its velocity ``Jν`` and its acceleration ``Jν̇ + J̇ν``.
+        """
+        for task in self.tasks:
+            if isinstance(task, TargetTask):
+                J = task.jacobian(state)
+                task.target = task.present(state)
+                task.target_velocity, task.target_acceleration = J @ state.v, J @ a + task.drift(state)
+        if self.posture is not None:
+            self.posture.lead(state.q, state.v, a)
 
 
 @checked

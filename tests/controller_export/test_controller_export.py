@@ -17,7 +17,9 @@ from impact_posture.controller_export.export_controller import export_controller
 from impact_posture.errors import ContactError, InputError
 from impact_posture.system.arrays import Array
 from impact_posture.tsid.controller import Command, Controller, Report, Status
+from impact_posture.tsid.state import State
 from impact_posture.tsid.tasks.impact_robust import ImpactRobustPosture, Spring, gradient_of
+from impact_posture.tsid.tasks.task import TargetTask
 from tests.support.exported_controller import (
     compiled,
     exported,
@@ -265,6 +267,29 @@ def test_a_moving_reference_leads_the_posture() -> None:
     a, b = python.tick(0.0, q, v), c.tick(0.0, q, v)
     assert difference(a, b) < 1e-9
     assert difference(a, c.reset(q, v)) > 1e-3
+
+
+@pytest.mark.parametrize("name", ["tilthex_arm", "panda", "solo8"])
+def test_a_motion_leads_all_tasks_as_in_python(name: str) -> None:
+    python, c, q, v = both_at_rest(name)
+    robot, formulation, rng = python.robot, python.formulation, np.random.default_rng(6)
+    (q_led, v_led), a_led = random_state(robot, rng, 0.01), 0.3 * rng.normal(size=robot.nv)
+    formulation.lead(State(robot, formulation.points).update(q_led, v_led), a_led)
+    c.lead(q_led, v_led, a_led)
+    a, b = python.tick(0.0, q, v), c.tick(0.0, q, v)
+    assert a.status is b.status is Status.SOLVED and difference(a, b) < 1e-9
+    for task in formulation.tasks:
+        if isinstance(task, TargetTask):
+            wanted = np.concatenate([task.target_velocity, task.target_acceleration])
+            row = c.targets[task.name]
+            have = np.concatenate([row[13 : 13 + task.size], row[19 : 19 + task.size]])
+            np.testing.assert_allclose(have, wanted, rtol=0, atol=1e-9)
+            assert np.abs(wanted).max() > 0.05
+            before = row.copy()
+            c.set_target(task.name, task.required_target(), *np.split(wanted, 2))
+            np.testing.assert_allclose(row, before, rtol=0, atol=1e-9)
+    with pytest.raises(InputError, match="a number is invalid"):
+        c.lead(q, v, np.full(robot.nv, np.nan))
 
 
 def test_a_reset_forgets_a_led_posture() -> None:

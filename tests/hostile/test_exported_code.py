@@ -14,6 +14,7 @@ from impact_posture.codegen.c_literals import REALS
 from impact_posture.codegen.export import export
 from tests.hostile.arena import judging
 from tests.support.exported_controller import exported, formulation_of, impact_of
+from tests.support.struck_paths import write_references
 from tests.support.tools import need_compiler
 
 SUPPORT = Path(__file__).parents[1] / "support"
@@ -64,6 +65,18 @@ def test_parameters_of_controllers(name: str, flow: bool, tmp_path: Path, hostil
             folder, "controller_parameters.c", "address,undefined,float-cast-overflow", tmp_path, str(sets)
         )
         judge(name, [fault] if fault else [], sets)
+
+
+@pytest.mark.parametrize(("name", "strikes"), [("panda", True), ("solo8", True), ("solo8", False)])
+def test_inputs_of_paths(name: str, strikes: bool, tmp_path: Path, hostile_full: bool) -> None:
+    if not strikes and not hostile_full:
+        pytest.skip("paths without a strike: give --hostile-full")
+    calls = 1_000_000 if hostile_full else 50_000
+    with judging() as judge:
+        folder = write_references(tmp_path / "path", name, strikes)
+        sanitizers = "address,undefined,float-cast-overflow,float-divide-by-zero"
+        fault = run_sanitized(folder, "path_inputs.c", sanitizers, tmp_path, str(calls))
+        judge(name, [fault] if fault else [], calls)
 
 
 @pytest.mark.parametrize(("name", "frame", "number", "threads"), METRICS)

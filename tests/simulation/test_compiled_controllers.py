@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,23 +20,11 @@ from impact_posture.simulation.setup import set_up
 from impact_posture.simulation.world.sensor_noise import Reading
 from impact_posture.system.libraries import cache_path
 from tests.simulation.factories import driven, shared_factory
-from tests.support.daqp import sources_or_skip
+
+pytestmark = pytest.mark.usefixtures("quick_builds")
 
 # Tolerated relative differences between Python and C, larger for a wall, because its contact amplifies rounding.
 BANDS = {"solo8-push": 1e-6, "aerial-vertical": 2e-2}
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _built(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """Use a separate cache and compile without optimization."""
-    sources_or_skip()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("CFLAGS", "-O0")
-        cache, used = tmp_path_factory.mktemp("cache"), cache_path()
-        for file in used.glob("daqp-*"):
-            shutil.copy(file, cache)
-        patch.setenv("IMPACT_POSTURE_CACHE", str(cache))
-        yield
 
 
 def in_c(name: str, **options: Any) -> ControllerFactory:

@@ -109,7 +109,8 @@ def test_all_controllers_share_gains_tasks_and_weights(monkeypatch: pytest.Monke
         )
         monkeypatch.setitem(vars(factory), "path", SimpleNamespace(strike=None, duration=0.0, at=still.at))
         strike = SimpleNamespace(follow_through=None, run_up_s=0.0, contact_s=0.0)
-        monkeypatch.setitem(vars(factory), "strike", SimpleNamespace(strike=strike, duration=0.0, at=still.at))
+        struck = SimpleNamespace(strike=strike, duration=0.0, at=still.at, **vars(still))
+        monkeypatch.setitem(vars(factory), "strike", struck)
         nominal = factory.driver("nominal").controller.formulation
         for controller in CONTROLLERS:
             formulation = factory.driver(controller).controller.formulation

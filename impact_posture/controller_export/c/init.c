@@ -61,5 +61,6 @@ int ip_init(ip_context *c, const ip_params *p)
   }
   c->excess *= 1e-6;
   IP_CONSTANTS(c, &c->m);
+  IP_CONSTANTS(c, &c->ahead);
   return 0;
 }

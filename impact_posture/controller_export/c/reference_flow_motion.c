@@ -243,7 +243,6 @@ static int ip_flow_begin(ip_context *c)
   f->deadline = f->remains = INFINITY;
   f->able = 1.0;
   IP_CONSTANTS(c, &f->m);
-  IP_CONSTANTS(c, &f->ahead);
   for (k = 0; k < IP_TASKS; ++k) {
     if (!ip_flow_led[k]) {
       ip_constant_rows(k, f->J[row]);
@@ -307,8 +306,7 @@ static void ip_flow_lead(ip_context *c, double dt)
     ip_flow_curve,   ip_flow_curve,     ip_flow_curve, ip_flow_curve, ip_flow_govern, ip_flow_curve, ip_flow_direct,
   };
   ip_flow *f = &c->flow;
-  double position[3], J[3 * IP_NV], drift[3];
-  int i, k;
+  int k;
   if (!ip_flow_moves(f)) {
     return;
   }
@@ -332,23 +330,12 @@ static void ip_flow_lead(ip_context *c, double dt)
     if (!ip_flow_led[k]) {
       continue;
     }
-    /* The next reset sets this target to the present output. */
-    target->set = -1.0;
     if (ip_flow_led[k] == 1) {
       /* Compute the model only for the first of these tasks, because the others read the same model. */
-      ip_dynamics(f->q, f->velocity, &f->ahead);
+      ip_dynamics(f->q, f->velocity, &c->ahead);
     }
-    if (ip_task_kind[k] == IP_MASS_CENTER) {
-      ip_center_of_mass(&f->ahead, f->q, position, J, drift);
-      for (i = 0; i < 3; ++i) {
-        target->position[i] = position[i];
-        target->velocity[i] = ip_dot(J + i * IP_NV, f->velocity, IP_NV);
-        target->acceleration[i] = ip_dot(J + i * IP_NV, f->acceleration, IP_NV) + drift[i];
-      }
-    } else {
-      memcpy(target->rotation, f->ahead.base, sizeof target->rotation);
-      memcpy(target->velocity, f->velocity + 3, sizeof(double) * 3);
-      memcpy(target->acceleration, f->acceleration + 3, sizeof(double) * 3);
-    }
+    ip_lead_target(target, k, &c->ahead, f->q, f->velocity, f->acceleration);
+    /* The next reset sets this target to the present output. */
+    target->set = -1.0;
   }
 }

@@ -81,25 +81,27 @@ static void ip_constant_rows(int k, double *J)
   }
 }
 
-/* Set a target to the present output of its task. */
-static void ip_present(const ip_context *c, int k, ip_target *target)
+/* Set a target to the output of its task.  m is the model of the robot at q. */
+static void ip_present(const ip_model *m, const double *q, int k, ip_target *target)
 {
   const int point = ip_task_point[k];
   double drift[3];
+  int i;
   switch (ip_task_kind[k]) {
   case IP_TILT:
-    target->position[0] = target->position[1] = 0.0;
-    target->position[2] = 1.0;
+    for (i = 0; i < 3; ++i) {
+      target->position[i] = m->base[3 * i + 2];
+    }
     break;
   case IP_BASE_TURN:
-    memcpy(target->rotation, c->m.base, sizeof target->rotation);
+    memcpy(target->rotation, m->base, sizeof target->rotation);
     break;
   case IP_MASS_CENTER:
-    ip_center_of_mass(&c->m, c->q, target->position, NULL, drift);
+    ip_center_of_mass(m, q, target->position, NULL, drift);
     break;
   default:
-    memcpy(target->position, c->m.position[point], sizeof target->position);
-    memcpy(target->rotation, c->m.rotation[point], sizeof target->rotation);
+    memcpy(target->position, m->position[point], sizeof target->position);
+    memcpy(target->rotation, m->rotation[point], sizeof target->rotation);
   }
   target->set = 1.0;
 }
@@ -169,6 +171,21 @@ static void ip_task_output(const ip_target *target, int k, const ip_model *m, co
       ip_combine(J + (3 + i) * IP_NV, IP_NV, across[i], 1, m->jacobian[point] + 3 * IP_NV, IP_NV, 3);
     }
     memcpy(drift + 3, w, sizeof(double) * 2);
+  }
+}
+
+/* Set a target to the output of its task in the motion (q, v, a).  m is the model of the robot at (q, v). */
+static APART void ip_lead_target(ip_target *target, int k, const ip_model *m, const double *q, const double *v,
+                                 const double *a)
+{
+  double e[6], drift[6] = {0}, J[6 * IP_NV] = {0};
+  int i;
+  ip_present(m, q, k, target);
+  ip_constant_rows(k, J);
+  ip_task_output(target, k, m, q, J, e, drift);
+  for (i = 0; i < ip_task_row[k + 1] - ip_task_row[k]; ++i) {
+    target->velocity[i] = ip_dot(J + i * IP_NV, v, IP_NV);
+    target->acceleration[i] = ip_dot(J + i * IP_NV, a, IP_NV) + drift[i];
   }
 }
 

@@ -122,6 +122,7 @@ static int ip_measured(const double *q, const double *v, const double *force)
 
 int ip_reset(ip_context *c, const double q[IP_NQ], const double v[IP_NV], ip_command *out)
 {
+  static const double upward[3] = {0.0, 0.0, 1.0};
   int i, k;
   if (!ip_measured(q, v, NULL)) {
     return 1;
@@ -138,7 +139,10 @@ int ip_reset(ip_context *c, const double q[IP_NQ], const double v[IP_NV], ip_com
       memset(&c->target[k], 0, sizeof c->target[k]);
     }
     if (c->target[k].set <= 0.0) {
-      ip_present(c, k, &c->target[k]);
+      ip_present(&c->m, c->q, k, &c->target[k]);
+      if (ip_task_kind[k] == IP_TILT) {
+        memcpy(c->target[k].position, upward, sizeof upward);
+      }
     }
   }
   ip_reset_posture(c);
@@ -225,6 +229,19 @@ int ip_lead_posture(ip_context *c, const double q[IP_NQ], const double v[IP_NV],
   memcpy(c->posture_velocity, v, sizeof c->posture_velocity);
   memcpy(c->posture_acceleration, a, sizeof c->posture_acceleration);
   c->blend = 1.0;
+  return 0;
+}
+
+int ip_lead(ip_context *c, const double q[IP_NQ], const double v[IP_NV], const double a[IP_NV])
+{
+  int k;
+  if (ip_lead_posture(c, q, v, a)) {
+    return 1;
+  }
+  ip_dynamics(q, v, &c->ahead);
+  for (k = 0; k < IP_TASKS; ++k) {
+    ip_lead_target(&c->target[k], k, &c->ahead, q, v, a);
+  }
   return 0;
 }
 

@@ -76,7 +76,7 @@ _PLAIN = {
     "impact-aware": ImpactAwareDriver,
 }
 # Driver classes that can use a controller in C.
-_IN_C = (Driver, RobustDriver, FlowDriver, PostureDriver)
+_IN_C = (Driver, RobustDriver, FlowDriver, PostureDriver, PathDriver, StrikeDriver)
 _KINDS: dict[str, ObjectiveKind] = {
     "robust-speed": "speed",
     "robust-sticking": "sticking",

@@ -20,6 +20,7 @@ from impact_posture.tsid.smooth_step import smooth
 from impact_posture.tsid.tasks.body_tasks import BaseOrientation, BodyTaskLead, CenterOfMass
 from impact_posture.tsid.tasks.impact_robust import ImpactRobustPosture
 from impact_posture.tsid.tasks.joint_posture import JointPosture
+from impact_posture.tsid.tasks.task import TargetTask
 
 # Duration of the motion of references to a new posture, s.
 MOVE = 1.0
@@ -32,9 +33,11 @@ class Driver:
         controller: The controller in Python.
         compiled: The same controller as machine code, which then computes the commands; ``None`` if the controller
             runs in Python.
+        leads_posture: Whether the posture task has a moving reference, which each tick sends to a controller in C.
     """
 
     compiled: CompiledTick | None = None
+    leads_posture = False
 
     def __init__(self, setup: Setup, posture: JointPosture) -> None:
         self.setup, self.posture = setup, posture
@@ -50,8 +53,9 @@ class Driver:
     def reset(self, q: Array) -> Command:
         """Start at rest at ``q``.  The targets of all tasks are reset to the present state."""
         end_effector, self._followed = self._end_effector, None
-        for task in (*([] if end_effector is None else [end_effector]), *self._body_tasks):
-            task.target, task.target_velocity, task.target_acceleration = None, 0.0, 0.0
+        for task in self.controller.formulation.tasks:
+            if isinstance(task, TargetTask):
+                task.target, task.target_velocity, task.target_acceleration = task.default_target(), 0.0, 0.0
         at_rest = np.zeros(self.setup.robot.nv)
         command = self.controller.reset(q, at_rest)
         self._home = None if end_effector is None else end_effector.target
@@ -192,6 +196,8 @@ class PathDriver(Driver):
             constraints.
     """
 
+    leads_posture = True
+
     def __init__(self, setup: Setup, posture: JointPosture, path: PosturePath) -> None:
         super().__init__(setup, posture)
         self.path = path
@@ -200,8 +206,6 @@ class PathDriver(Driver):
 
     def reset(self, q: Array) -> Command:
         self._since = None
-        rest = np.zeros(self.setup.robot.nv)
-        self.posture.lead(q, rest, rest)
         return super().reset(q)
 
     def brace(self) -> None:
@@ -216,6 +220,8 @@ class PathDriver(Driver):
             else:
                 q, v, a = path.at(self._since)
             self.posture.lead(q, v, a)
+            if self.compiled is not None:
+                self.compiled.library.lead_posture(q, v, a)
             self._body.lead(self._body_tasks, q, v, a)
         super().lead(t, reference)
 
