@@ -86,6 +86,7 @@ STUDIES = {
         Study("search-catalogue", "search_quality:catalogue", "the same for the catalogue; seeds", 3, page=False),
         Study("flow", "flow", "where the reference flow rests, from random starts", 1000, target="study-flow"),
         Study("strikes", "strikes", "planned strikes beside others; seeds", 10, target="study-strikes"),
+        Study("strike-instants", "strikes:instants", "early and late contacts of strikes", target="study-strikes"),
         Study("real-impacts", "real_impacts", "balls, strikes, taps, as predicted", target="study-real-impacts"),
         Study("points", "robustness.study:points", "runs the points of the next two; random draws", 40, page=False),
         Study("robustness", "robustness.study", "where each controller helps", target="study-robustness"),

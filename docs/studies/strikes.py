@@ -16,6 +16,7 @@ import numpy as np
 
 from docs.studies.core import ROOT, Request, collected, kept, table
 from docs.studies.real_impacts import scenario_of
+from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import ImpactPostureError
 from impact_posture.experiment.job_store import key_of
 from impact_posture.experiment.jobs import Job, execute
@@ -23,9 +24,13 @@ from impact_posture.simulation.controllers.contact_reference import Reference
 from impact_posture.simulation.controllers.controller_factory import ControllerFactory
 from impact_posture.simulation.metrics import saturated
 from impact_posture.simulation.offline_posture import OfflinePosture, offline_posture
+from impact_posture.simulation.outcome import judge
+from impact_posture.simulation.prediction import predict
+from impact_posture.simulation.run import run as simulate
 from impact_posture.simulation.scenario_file import RepeatedContacts, Scenario, Spread
 from impact_posture.simulation.seed_variation import set_up_with
 from impact_posture.simulation.setup import set_up
+from impact_posture.system.arrays import Array
 
 # A number after a name replaces the approach speed of the scenario, m/s.
 CASES = (
@@ -149,3 +154,61 @@ def _notes(runs: list[dict[str, Any]]) -> Iterator[str]:
         why = f" ({stop['hindrance']})" if stop["hindrance"] else ""
         length, stops = 1e3 * plan["run_up_m"], f"{stop['stopped']} of {stop['impacts']}"
         yield f"planned run-up of {length:.0f} mm{most}; can stop after {stops} impacts{why}"
+
+
+# Scenarios, and delays (s) of contacts that are early or late; after REST (s), the contact point is at rest.
+INSTANTS, LATE, REST = ("panda-tap", "ur5-strike", "aerial-vertical"), (-0.05, -0.02, 0.0, 0.02, 0.05), 0.25
+INSTANTS_HEAD = (
+    "scenario", "contact, ms late", "its speed, m/s", "planned speed then, m/s", "measured / predicted jump",
+    "at a limit in the run-up, ms", "after the contact, ms", f"speed {REST:g} s later, m/s", "outcome",
+)  # fmt: skip
+
+
+def instants(request: Request) -> Iterator[str]:
+    """Yield a table of contacts before and after their expected instants."""
+    cases = [case for case in INSTANTS if request.only in case]
+    rows = collected(lambda k: list(_early_and_late(cases[k])), len(cases), request.jobs, "scenarios")
+    yield from table(INSTANTS_HEAD, [row for part in rows for row in part])
+
+
+def _early_and_late(case: str) -> Iterator[list[str]]:
+    """Yield a row for each delay: the surface is nearer or farther than the controller expects."""
+    scenario, task = varied(case)
+    setup = set_up(scenario)
+    factory, model = ControllerFactory(setup, compile="auto"), setup.robot.model
+    path, objective, numeric, normal = factory.strike, factory.objective(), Numeric(model), scenario.normal
+    assert path.strike is not None
+    contact, point = path.strike.contact_s, objective.oracle.point
+    reference = Reference(task, setup.gap)
+    begin = reference.start(0) + reference.crossing
+
+    def height(t: float) -> float:
+        return float(normal @ numeric.at(path.at(t)[0]).placement(point).translation)
+
+    def speed(q: Array, v: Array) -> float:
+        return float(-normal @ numeric.at(q).jacobian(point)[:3] @ v)
+
+    for late in LATE:
+        # After the planned contact, the references continue with its speed.
+        then = contact + min(late, 0.0)
+        nearer = height(then) - height(contact) - max(late, 0.0) * path.strike.speed
+        moved = replace(scenario.surface, gap=scenario.surface.gap - nearer)
+        surfaces = tuple(moved if s == scenario.surface else s for s in scenario.surfaces)
+        world = set_up(replace(scenario, surfaces=surfaces)).world
+        shifted = replace(setup, world=world, expected_gap=setup.gap)
+        repeated = ControllerFactory(shifted, compile="auto")
+        vars(repeated)["strike"] = path
+        (record,) = simulate(repeated, "strike")
+        ((window,), series), limits = (record.of("impact"), record.series), []
+        for first, last in ((begin + path.strike.run_up_s - contact, window.begin), (window.begin, window.end)):
+            ticks = np.logical_or(*saturated(shifted, series))[series.slice(first, last)]
+            limits.append(f"{1e3 * ticks.sum() * scenario.control.period:.0f}")
+        made = predict(shifted, objective, record)
+        k = int(np.searchsorted(series.t, window.begin + REST))
+        events = judge(shifted, record)
+        yield [
+            f"`{case}`", f"{1e3 * (window.begin - begin):+.0f}" if made else "–",
+            f"{made[0].approach:.2f}" if made else "–", f"{speed(*path.at(then)[:2]):.2f}",
+            f"{made[0].ratio:.2f}" if made else "–", *limits, f"{abs(speed(series.q[k], series.v[k])):.3f}",
+            "; ".join(event.what for event in events) or "completed",
+        ]  # fmt: skip
