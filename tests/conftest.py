@@ -32,6 +32,7 @@ from hypothesis import HealthCheck, settings  # noqa: E402
 
 from impact_posture.impact.impact_contact import ImpactContact  # noqa: E402
 from impact_posture.impact.worst_case_objective import WorstCaseObjective  # noqa: E402
+from impact_posture.posture.search import conflicts  # noqa: E402
 from impact_posture.robot.robot_loader import load_robot  # noqa: E402
 from tests.support.rounding import other_rounding  # noqa: E402
 
@@ -61,6 +62,13 @@ def unoptimized(request: pytest.FixtureRequest) -> Iterator[None]:
         if not getattr(request.module, "OPTIMIZED", False):
             patch.setenv("CFLAGS", "-O0")
         yield
+
+
+@pytest.fixture
+def few_tries(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Relax infeasible problems from 4 of 12 postures, for tests of problems with an obvious conflict."""
+    monkeypatch.setattr(conflicts, "_TRIES", 4)
+    monkeypatch.setattr(conflicts, "_DRAWN", 12)
 
 
 @pytest.fixture

@@ -138,6 +138,7 @@ def test_full_disk_leaves_nothing(tmp_path: Path) -> None:
         subprocess.run(["umount", str(disk)], check=True)
 
 
+@pytest.mark.usefixtures("few_tries")
 def test_infeasible_exits_3_and_names_the_conflict(tmp_path: Path) -> None:
     done = run("optimize", "panda", "--normal", 0, 0, 1, "--target-position", 3, 0, 0, "--json", *FAST, cwd=tmp_path)
     refused(done, 3, "pose of panda_hand_tcp")

@@ -310,6 +310,7 @@ def test_a_tight_limit_is_kept_and_has_a_multiplier() -> None:
     assert f"torque of {posed.robot.tangent_names[tight]} at rest" in names
 
 
+@pytest.mark.usefixtures("few_tries")
 @pytest.mark.parametrize(
     ("name", "normal", "force", "named", "size"),
     [

@@ -177,6 +177,7 @@ def test_given_posture_is_moved_to_the_constraints() -> None:
     assert reached == pytest.approx([0.1, 0.02, -0.55], abs=1e-8)
 
 
+@pytest.mark.usefixtures("few_tries")
 def test_infeasible_names_the_conflicting_constraint() -> None:
     problem = problem_of("panda", target_position=(2.0, 0.0, 0.5))
     with pytest.raises(Infeasible, match="pose of panda_hand_tcp") as caught:
@@ -186,6 +187,7 @@ def test_infeasible_names_the_conflicting_constraint() -> None:
     assert sum(caught.value.conflicts.values()) > 0.9
 
 
+@pytest.mark.usefixtures("few_tries")
 def test_two_constraints_in_conflict_are_both_candidates() -> None:
     problem = problem_of("tilthex_arm", base="fixed", target_position=(0.5, 0.5, -0.6))
     with pytest.raises(Infeasible) as caught:

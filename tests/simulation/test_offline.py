@@ -66,6 +66,7 @@ def test_the_share_of_the_limits_counts() -> None:
         assert f"within {100 * share:g} % of their limits at rest" in cases.cases[0].description
 
 
+@pytest.mark.usefixtures("few_tries")
 def test_a_note_reports_possible_collisions(monkeypatch: pytest.MonkeyPatch) -> None:
     setup = set_up(read_scenario("aerial-vertical"))
     objective = scenario_objective(setup)
