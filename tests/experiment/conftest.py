@@ -24,8 +24,8 @@ def aerial(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A scenario with one early contact with the wall."""
     pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")
     path = tmp_path_factory.mktemp("scenarios") / "aerial.toml"
-    text = shortened("aerial-lateral", count=1, settle=0.1, dwell=0.2, pause=0.05, gap=0.06)
-    path.write_text(text, encoding="utf-8")
+    short = {"count": 1, "settle": 0.1, "dwell": 0.2, "pause": 0.05, "gap": 0.06}
+    path.write_text(shortened("aerial-lateral", **short, timestep=0.0005, period=0.002), encoding="utf-8")
     return path
 
 
@@ -34,5 +34,6 @@ def push(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A scenario with early pushes in both directions."""
     pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")
     path = tmp_path_factory.mktemp("scenarios") / "push.toml"
-    path.write_text(shortened("solo8-push", settle=0.3, quiet=0.5, still=0.05, after=0.1), encoding="utf-8")
+    short = {"settle": 0.3, "quiet": 0.5, "still": 0.05, "after": 0.1}
+    path.write_text(shortened("solo8-push", **short, timestep=0.001, period=0.002), encoding="utf-8")
     return path

@@ -62,7 +62,7 @@ def test_simulate(aerial: Path, tmp_path: Path) -> None:
     series = Series.load(tmp_path / "run" / "series.npz")
     window = result["windows"][0]
     speed = np.linalg.norm(series.v[series.slice(window["begin"], window["end"])], axis=1)
-    assert speed.sum() * 1e-3 == pytest.approx(result["metrics"]["q_total_impact"])
+    assert speed.sum() * 2e-3 == pytest.approx(result["metrics"]["q_total_impact"])
     assert list((tmp_path / "run").glob("*.png")) and not list((tmp_path / "run").glob("*.pdf"))
     # Replacing an existing folder requires --force.  The same command gives the same result.
     refused = start("simulate", str(aerial), "--controller", "robust", "--out", "run", cwd=tmp_path)
@@ -241,7 +241,9 @@ def test_reproduce(tmp_path: Path) -> None:
     # A shipped scenario with a short wait and a short recovery.
     shipped = tmp_path / "scenarios"
     shipped.mkdir()
-    (shipped / "solo8-push.toml").write_text(shortened("solo8-push", settle=1.0, patience=1.0, after=0.1))
+    (shipped / "solo8-push.toml").write_text(
+        shortened("solo8-push", settle=1.0, patience=1.0, after=0.1, timestep=0.001, period=0.002)
+    )
     command = "reproduce --scenario solo8-push --seeds 1 --out all --format png".split()
     result = document(*command, cwd=tmp_path, prepare=lambda: setattr(scenario_file, "SHIPPED", shipped))
     rows = {row["controller"]: row for row in result["rows"]}

@@ -58,7 +58,8 @@ speed = [1, 2]
 
 def write_short_scenario(folder: Path) -> None:
     """Write ``short.toml``, a scenario with one early contact."""
-    text = shortened("aerial-vertical", count=1, gap=0.1, settle=0.1, dwell=0.2, pause=0.05)
+    short = {"count": 1, "gap": 0.1, "settle": 0.1, "dwell": 0.2, "pause": 0.05}
+    text = shortened("aerial-vertical", **short, timestep=0.0005, period=0.002)
     (folder / "short.toml").write_text(text, encoding="utf-8")
 
 

@@ -28,7 +28,7 @@ robot = "{robot}"
 {more}
 
 [physics]
-timestep = 0.0005
+timestep = 0.001
 
 [[surfaces]]
 name = "table"
@@ -48,6 +48,9 @@ settle = 0.2
 dwell = 0.1
 pause = 0.05
 
+[control]
+period = 0.002
+
 [control.end_effector]
 kp = 100
 
@@ -63,15 +66,18 @@ def needs_mujoco() -> None:
     pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")
 
 
-def shortened(source: str | Path, **changes: Any) -> Setup:
-    """Set up a scenario with a single contact or a short wait, and with changed task settings."""
+def shortened(source: str | Path, slower: int = 1, **changes: Any) -> Setup:
+    """Set up a scenario with a single contact or a short wait, slower rates and changed task settings."""
     scenario = read_scenario(source)
     if scenario.contacts:
         short: dict[str, Any] = {"count": 1, "settle": 0.3, "dwell": 0.2, "pause": 0.05}
     else:
         short = {"settle": 0.1, "patience": 0.3, "duration": 0.2, "after": 0.05}
     key = "contacts" if scenario.contacts else "push"
-    return set_up(replace(scenario, **{key: replace(scenario.task, **{**short, **changes})}))
+    physics = replace(scenario.physics, timestep=slower * scenario.physics.timestep)
+    control = replace(scenario.control, period=slower * scenario.control.period)
+    task = replace(scenario.task, **{**short, **changes})
+    return set_up(replace(scenario, physics=physics, control=control, **{key: task}))
 
 
 def controller_factory(setup: Setup, free: bool = False) -> ControllerFactory:
@@ -79,14 +85,20 @@ def controller_factory(setup: Setup, free: bool = False) -> ControllerFactory:
     return ControllerFactory(setup, free=free, gradient_of=interpreted, starts=2)
 
 
-def near(name: str, **changes: Any) -> Setup:
-    """Set up a short variant of a shipped scenario whose surfaces are 5 cm nearer."""
-    setup = shortened(name, **changes)
+def near(name: str, slower: int = 2, **changes: Any) -> Setup:
+    """Set up a short variant of a shipped scenario with slower rates and surfaces that are 5 cm nearer."""
+    setup = shortened(name, slower, **changes)
     if name in PUSHES:
         return setup
     scenario = setup.scenario
     surfaces = tuple(replace(s, gap=s.gap - 0.05) for s in scenario.surfaces)
     return set_up(replace(scenario, surfaces=surfaces))
+
+
+@functools.cache
+def shared_setup(name: str) -> Setup:
+    """Return the setup of a scenario from :func:`near`, with the rates of the scenario."""
+    return near(name, slower=1)
 
 
 @functools.cache

@@ -134,9 +134,10 @@ def test_the_simulated_robot_reaches_the_resting_posture(name: str) -> None:
     command = driver.reset(q)
     world.reset(q, rotor_speed=command.rotor_speed)
     driver.brace()
-    for _ in range(600):
+    period = factory.setup.scenario.control.period
+    for _ in range(round(0.6 / period)):
         command = driver.tick(world.read())
-        world.step(command, round(1e-3 / world.timestep))
+        world.step(command, round(period / world.timestep))
     joints = slice(6, None)
     moved = pin.difference(factory.setup.robot.model, q, predicted)[joints]
     missed = pin.difference(factory.setup.robot.model, world.truth().q, predicted)[joints]
@@ -153,7 +154,8 @@ def walk(name: str, seconds: float) -> tuple[WalkerDriver, Any, Vector]:
     assert isinstance(driver, WalkerDriver)
     command = driver.reset(factory.setup.q)
     world.reset(factory.setup.q, rotor_speed=command.rotor_speed)
-    count, period = round(1e-3 / world.timestep), factory.setup.scenario.control.period
+    period = factory.setup.scenario.control.period
+    count = round(period / world.timestep)
     driver.brace()
     for _ in range(round(seconds / period)):
         before = driver.posture.target.copy()

@@ -15,7 +15,7 @@ from impact_posture.simulation.recorder import STATUSES
 from impact_posture.simulation.run import Run
 from impact_posture.simulation.series import Series, Window
 from impact_posture.tsid.controller import Status
-from tests.simulation.factories import by_hand, fields_of, shared_factory
+from tests.simulation.factories import by_hand, fields_of, shared_setup
 
 
 def touch(begin: float, length: float = 0.3, contact: int = 0, kind: str = "impact", touched: bool = True) -> Window:
@@ -23,7 +23,7 @@ def touch(begin: float, length: float = 0.3, contact: int = 0, kind: str = "impa
 
 
 def measured(columns: dict[str, Any], *windows: Window, n: int = 1000) -> Any:
-    setup = shared_factory("aerial-vertical").setup
+    setup = shared_setup("aerial-vertical")
     return measure(setup, Run(by_hand(setup, n, **columns), windows))
 
 
@@ -63,7 +63,7 @@ def test_ticks_outside_the_windows_do_not_count() -> None:
 
 @pytest.mark.parametrize("begin", [0.2, 0.20000000000001, 0.19999999999999, 0.2003, 0.2007, 0.3 - 0.1])
 def test_a_window_always_has_the_same_number_of_ticks(begin: float) -> None:
-    setup = shared_factory("aerial-vertical").setup
+    setup = shared_setup("aerial-vertical")
     # Compare the time of the world (steps times time step) with the time of MuJoCo (sum of time steps).
     for t in (0.25e-3 * 4 * np.arange(1, 1001), np.cumsum(np.full(4000, 0.25e-3))[3::4]):
         part = by_hand(setup, 1000, t=t).slice(begin, begin + 0.3)
@@ -72,7 +72,7 @@ def test_a_window_always_has_the_same_number_of_ticks(begin: float) -> None:
 
 
 def test_a_delayed_motion_is_in_the_recovery() -> None:
-    setup = shared_factory("aerial-vertical").setup
+    setup = shared_setup("aerial-vertical")
     v = np.zeros((1000, 9))
     v[:201, 0] = 0.5
     # The robot moves only after the window.
@@ -103,7 +103,7 @@ def test_the_jump_is_the_largest_within_fifteen_milliseconds() -> None:
 
 
 def test_the_jump_begins_at_the_last_tick_before_the_touch() -> None:
-    setup = shared_factory("aerial-vertical").setup
+    setup = shared_setup("aerial-vertical")
     v = np.arange(1000)[:, None] * np.ones(9)
     series = by_hand(setup, 1000, v=v)
     # The first touch is in tick 200, which ends at 0.201 s, so tick 199 is the last tick before the touch.
@@ -124,7 +124,7 @@ def test_mean_and_largest_jump_of_the_contacts() -> None:
 
 
 def test_base_worst_joint_and_impulse_of_each_window() -> None:
-    setup = shared_factory("aerial-vertical").setup
+    setup = shared_setup("aerial-vertical")
     limits, names = setup.robot.velocity_limits, setup.robot.tangent_names
     generator = np.random.default_rng(5)
     v = generator.normal(size=(1000, 9)) * np.where(np.isfinite(limits), limits, 1.0)
@@ -155,7 +155,7 @@ def test_base_worst_joint_and_impulse_of_each_window() -> None:
 
 
 def test_a_fixed_robot_has_no_base() -> None:
-    setup = shared_factory("panda-tap").setup
+    setup = shared_setup("panda-tap")
     v = np.zeros((1000, setup.robot.nv))
     v[300:, 2] = 0.4
     load = measure(setup, Run(by_hand(setup, 1000, v=v), (touch(0.2),))).load
@@ -166,7 +166,7 @@ def test_a_fixed_robot_has_no_base() -> None:
 
 
 def test_saturation_inside_and_outside_the_windows() -> None:
-    setup = shared_factory("aerial-vertical").setup
+    setup = shared_setup("aerial-vertical")
     propulsion = setup.robot.spec.propulsion
     assert propulsion is not None
     limits = np.asarray(setup.robot.model.effortLimit)[6:]
@@ -196,7 +196,7 @@ def test_relaxed_and_failed_ticks_stops_and_contacts() -> None:
 
 
 def test_the_jump_of_a_push_is_the_largest_speed() -> None:
-    setup = shared_factory("solo8-push").setup
+    setup = shared_setup("solo8-push")
     v, peak = np.zeros((1000, 14)), np.zeros(1000)
     v[:, 0], v[350, 0], v[700, 0] = 0.1, -0.6, 5.0
     peak[200:600] = 6.5
@@ -215,7 +215,7 @@ def test_metrics_are_json() -> None:
 
 
 def test_a_saved_series_can_be_loaded(tmp_path: Path) -> None:
-    setup = shared_factory("aerial-vertical").setup
+    setup = shared_setup("aerial-vertical")
     series = by_hand(setup, 20, v=np.random.default_rng(0).normal(size=(20, 9)))
     series.save(tmp_path / "series.npz")
     again = Series.load(tmp_path / "series.npz")

@@ -208,4 +208,4 @@ def test_links_that_touch_are_named_after_a_run(tmp_path: Path) -> None:
     moved = replace(run_, series=replace(run_.series, q=folded))
     (line,) = (line for line in doubts(setup, [moved], [], None) if "touched" in line)
     pairs = ("hand and world", "fore and world", "upper and world", "base and upper")
-    assert line == f"links touched: {', '.join(f'{pair} (t = 0.04 s)' for pair in pairs)}"
+    assert line == f"links touched: {', '.join(f'{pair} (t = 0.08 s)' for pair in pairs)}"

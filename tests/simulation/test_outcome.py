@@ -25,7 +25,7 @@ from tests.simulation.factories import (
     by_hand,
     controller_factory,
     driven,
-    shared_factory,
+    shared_setup,
     shortened,
 )
 
@@ -48,12 +48,12 @@ def turned(setup: Setup, axis: tuple[float, float, float], degrees: float) -> np
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_a_robot_at_rest_completes(name: str) -> None:
-    assert judged(shared_factory(name).setup, {}) == ()
+    assert judged(shared_setup(name), {}) == ()
 
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_tilt_is_measured_from_the_start_without_yaw(name: str) -> None:
-    setup = shared_factory(name).setup
+    setup = shared_setup(name)
     assert judged(setup, {"q": turned(setup, (0, 0, 1), 170)}) == ()
     assert judged(setup, {"q": turned(setup, (1, 0, 0), 59)}) == ()
     (event,) = judged(setup, {"q": turned(setup, (0, 1, 0), -61)})
@@ -61,7 +61,7 @@ def test_tilt_is_measured_from_the_start_without_yaw(name: str) -> None:
 
 
 def test_links_without_shapes_behind_a_surface_are_a_warning() -> None:
-    setup = shared_factory("aerial-vertical").setup
+    setup = shared_setup("aerial-vertical")
     surface = setup.scenario.surfaces[0].name
     n, point = setup.world.built.normals[surface], setup.world.built.points[surface]
     data = setup.robot.model.createData()
@@ -82,7 +82,7 @@ def test_links_without_shapes_behind_a_surface_are_a_warning() -> None:
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_a_base_below_the_surface_or_its_start_fell(name: str) -> None:
-    setup = shared_factory(name).setup
+    setup = shared_setup(name)
     surface = setup.scenario.surfaces[0].name
     n, point = setup.world.built.normals[surface], setup.world.built.points[surface]
     q = np.tile(setup.q, (1000, 1))
@@ -113,7 +113,7 @@ def test_relaxed_and_held_ticks(status: int, begin: int, length: int, words: str
     column = np.zeros(1000, int)
     column[begin : begin + length] = status
     for name in ("aerial-lateral", "solo8-push"):
-        events = judged(shared_factory(name).setup, {"status": column})
+        events = judged(shared_setup(name), {"status": column})
         if words is None:
             assert events == ()
         else:
@@ -122,7 +122,7 @@ def test_relaxed_and_held_ticks(status: int, begin: int, length: int, words: str
 
 
 def test_lifted_feet_and_missed_contacts() -> None:
-    setup = shared_factory("solo8-push").setup
+    setup = shared_setup("solo8-push")
     feet = np.ones((1000, 4), bool)
     feet[200:300, 1] = False
     assert judged(setup, {"feet": feet}) == ()
@@ -130,12 +130,12 @@ def test_lifted_feet_and_missed_contacts() -> None:
     (event,) = judged(setup, {"feet": feet})
     assert event.status == "lost contact" and event.what == "FR_FOOT left the ground for 0.101 s"
     windows = [Window("impact", k, 0.1 + 0.2 * k, 0.2 + 0.2 * k, k != 2) for k in range(4)]
-    (event,) = judged(shared_factory("aerial-vertical").setup, {}, windows=tuple(windows))
+    (event,) = judged(shared_setup("aerial-vertical"), {}, windows=tuple(windows))
     assert event.status == "lost contact" and event.what.startswith("1 of 4 contacts") and event.time == 0.5
 
 
 def test_the_scenario_sets_the_bounds() -> None:
-    setup = shared_factory("solo8-push").setup
+    setup = shared_setup("solo8-push")
     feet, status = np.ones((1000, 4), bool), np.zeros(1000, int)
     feet[200:400, 1], status[500:600] = False, HELD
     columns = {"feet": feet, "status": status, "q": turned(setup, (0, 1, 0), 70)}
@@ -148,7 +148,7 @@ def test_the_scenario_sets_the_bounds() -> None:
 
 
 def test_a_strongly_pushed_robot_fell() -> None:
-    factory = controller_factory(shortened("solo8-push", force=(60.0, 0.0, 0.0), after=0.5))
+    factory = controller_factory(shortened("solo8-push", 2, force=(60.0, 0.0, 0.0), after=0.5))
     record = driven(factory, "nominal")
     events = judge(factory.setup, record)
     assert "fell" in {e.status for e in events}
@@ -157,7 +157,7 @@ def test_a_strongly_pushed_robot_fell() -> None:
 
 def test_a_run_ends_when_the_state_diverges(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("aerial-lateral", "solo8-push"):
-        factory = controller_factory(shortened(name))
+        factory = controller_factory(shortened(name, 2))
         world, step = factory.setup.world, factory.setup.world.step
 
         def away(command: Any, count: int = 1, world: Any = world, step: Any = step) -> None:
@@ -215,7 +215,7 @@ def test_a_robot_that_would_fall_is_refused(
 def test_rotors_that_touch_a_surface_and_limits_in_a_window_are_warnings() -> None:
     """A wall 5 cm before the rotors: the arm is held back, so the base runs into the wall."""
     setup = set_up(read_scenario("aerial-lateral"))
-    run_ = driven(controller_factory(shortened("aerial-lateral", settle=0.2)), "nominal")
+    run_ = driven(controller_factory(shortened("aerial-lateral", 2, settle=0.2)), "nominal")
     assert not [line for line in doubts(setup, [run_], [measure(setup, run_)], 1.0) if "touched" in line]
     forward = replace(run_.series, q=run_.series.q + 0.4 * np.eye(setup.robot.nq)[0])
     moved = replace(run_, series=forward)

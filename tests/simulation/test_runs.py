@@ -81,7 +81,7 @@ def test_runs_with_both_signs_mirror_each_other_roughly() -> None:
         (window,) = record.of("impact")
         part = record.series.slice(window.begin, window.end)
         assert record.sign * (record.series.q[part.stop, 0] - factory.setup.q[0]) > 0.002
-        np.testing.assert_array_equal(record.series.force[part], np.tile([record.sign * 6.5, 0, 0], (200, 1)))
+        np.testing.assert_array_equal(record.series.force[part], np.tile([record.sign * 6.5, 0, 0], (100, 1)))
         assert not record.series.force[: part.start].any() and not record.series.force[part.stop :].any()
 
 
@@ -135,11 +135,11 @@ def test_windows_begin_at_the_first_touch(name: str) -> None:
         assert recovery.begin == impact.begin
         assert recovery.end == pytest.approx(min(impact.begin + 1, reference.total))
         first = int(np.argmax(series.touching > 0))
-        assert series.t[first] - 1e-3 - 1e-9 <= impact.begin <= series.t[first]
+        assert series.t[first] - 2e-3 - 1e-9 <= impact.begin <= series.t[first]
         assert impact.end - impact.begin == pytest.approx(task.window)
         assert (dwell.begin, dwell.end) == (impact.begin, pytest.approx(leaves))
         part = series.slice(impact.begin, impact.end)
-        assert part.stop - part.start == 300
+        assert part.stop - part.start == 150
         # The contact is never earlier than the reference, but may be late while the robot still reconfigures.
         crossing = task.settle + reference.crossing
         assert crossing - 0.03 < impact.begin < (crossing + 0.03 if controller == "nominal" else leaves)

@@ -207,6 +207,9 @@ def test_a_robot_with_one_joint_runs(folder: Path) -> None:
     others = [name for name in setup.robot.joint_names if name != "elbow"]
     text = LED.replace('robot = "rail_arm.urdf"', f'robot = "rail_arm.urdf"\nlock = {others}'.replace("'", '"'))
     text = text.replace("speed = 0.2", "speed = 0.2\ncount = 1\nsettle = 1.0")
+    text = text.replace("timestep = 0.0005", "timestep = 0.001").replace(
+        "[control.posture]", "[control]\nperiod = 0.002\n\n[control.posture]"
+    )
     one = set_up(read_scenario(write(folder, text)))
     assert one.robot.nv == 1
     factory = ControllerFactory(one)
@@ -347,6 +350,7 @@ def test_an_error_keeps_a_key_of_robot_toml() -> None:
         assert caught.value.where == named
 
 
+@pytest.mark.usefixtures("few_tries")
 def test_an_infeasible_offline_posture_names_keys(tmp_path: Path) -> None:
     text = (SHIPPED_FOLDER / "panda-tap.toml").read_text(encoding="utf-8")
     path = tmp_path / "mine.toml"

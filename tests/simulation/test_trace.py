@@ -9,7 +9,7 @@ from impact_posture.errors import InputError
 from impact_posture.simulation.world import contact_forces
 from impact_posture.simulation.world.actuator_command import ActuatorCommand
 from impact_posture.simulation.world.world import World
-from tests.simulation.factories import shared_factory
+from tests.simulation.factories import shared_setup
 from tests.support.helpers import rng
 
 mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")
@@ -20,7 +20,7 @@ SCENARIOS = ("aerial-vertical", "solo8-push", "panda-tap")
 
 def shaken(name: str, ticks: int = 40) -> tuple[World, list[ActuatorCommand]]:
     """Return a world near its surface, and commands that move the robot toward it."""
-    setup, random = shared_factory(name).setup, rng(name)
+    setup, random = shared_setup(name), rng(name)
     robot, world = setup.robot, setup.world
     rotors = 0 if robot.spec.propulsion is None else len(robot.spec.propulsion.rotors)
     joints = robot.nv - robot.first_joint

@@ -31,7 +31,7 @@ name = "mine"
 robot = "{robot}"
 
 [physics]
-timestep = 0.0005
+timestep = 0.001
 
 [[surfaces]]
 name = "ground"
@@ -46,6 +46,9 @@ duration = 0.2
 settle = 0.1
 patience = 0.3
 after = 0.05
+
+[control]
+period = 0.002
 
 [control.center_of_mass]
 kp = 65
