@@ -10,13 +10,15 @@ import pinocchio as pin
 
 from impact_posture.dynamics.chart import Chart
 from impact_posture.posture.manifold.feasible_start import Projector
-from impact_posture.posture.program.constrained_problem import ConstrainedProblem
+from impact_posture.posture.program.constrained_problem import ConstrainedProblem, equality_jacobian
 from impact_posture.system.arrays import Array
 
 # Largest violation of equalities and of inequalities at a valid posture (m, rad, or the unit of the constraint).
 EQUALITY, INEQUALITY = 1e-6, 1e-8
 # Largest motion of a frame of the robot between two checked postures, m.
 CHECK_DISTANCE = 2e-2
+# Largest number of steps that separate bodies.
+_SEPARATIONS = 5
 # Tangent length of a step along the constraints, rad mixed with m.
 STEP = 0.05
 # A step is stuck if it comes nearer to its target by less than this share of its length.
@@ -73,6 +75,28 @@ class PathSpace:
         self.pulls += 1
         projected = self.projector.project(q if step is None else np.asarray(pin.integrate(self.model, q, step))).q
         return projected if self.valid(projected) else None
+
+    def apart(self, q: Array) -> Array | None:
+        """Return a valid posture near ``q``, shape (nq,), where links or bodies may be too near; ``None`` if none is.
+
+        Only these constraints are not pulled.  Linearized, they are satisfied with a quarter more than the violation.
+        """
+        for _ in range(_SEPARATIONS):
+            q = self.projector.project(q).q
+            if self.valid(q):
+                return q
+            model = self.projector.numeric.at(q)
+            excess, rows = np.zeros(0), equality_jacobian(self.problem, model)
+            held = len(rows)
+            for c in self.problem.constraints:
+                if not c.projected:
+                    value, jacobian = c.evaluate(model)
+                    violated = np.flatnonzero(c.excess(value))
+                    excess = np.append(excess, c.excess(value)[violated])
+                    rows = np.vstack([rows, jacobian[violated]])
+            step = np.linalg.pinv(rows, rcond=1e-6) @ np.append(np.zeros(held), -1.25 * excess)
+            q = np.array(pin.integrate(self.model, q, step))
+        return None
 
     def size(self, step: Array) -> float:
         """Return the size of a tangent step.  Between two successive checked postures, the size is at most 1.

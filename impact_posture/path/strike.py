@@ -18,6 +18,7 @@ from impact_posture.path.strike_spaces import StrikeSpaces
 from impact_posture.path.stroke import SHORTEST, shortest_stroke
 from impact_posture.path.timed_curve import TimedCurve, sampled
 from impact_posture.posture.constraints.center_of_mass_over_feet import CenterOfMassOverFeet
+from impact_posture.posture.loads.holdable import Holdable, ReachableWrench
 from impact_posture.posture.program.certificate import linearized_limits
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem
 from impact_posture.system.arrays import Array, null_space
@@ -26,6 +27,11 @@ from impact_posture.system.arrays import Array, null_space
 _UNIQUE = 1e-4
 # Weight of the share of the room that exceeds 1, relative to the largest share of a velocity limit.
 _CROWDED = 100.0
+# If possible, the robot comes from the inside of an active bound with this share of the contact speed (rad/s or m/s).
+# Otherwise, the curve of the run-up would bend across the bound at once.
+_RATE = 0.02
+# An inequality or joint limit is active within this distance (m, rad, or the unit of the constraint).
+_ACTIVE = 1e-3
 # A contact velocity that the joints miss by more than this share cannot be reached.
 _MISSED = 1e-9
 # Number of bisections for the greatest speed.
@@ -72,19 +78,25 @@ def check_strike(problem: ConstrainedProblem, speed: float) -> None:
         raise InputError(fault, where="strike", hint=hint)
 
 
-def _room(space: PathSpace, q: Array) -> tuple[Array, Array]:
+def _room(space: PathSpace, q: Array) -> tuple[Array, Array, Array]:
     """Return rows ``g``, shape (m, nv), and distances, shape (m,), such that a step ``δ`` needs ``gᵀδ ≤`` distance.
 
-    A row is the gradient of an inequality or joint limit.
+    A row is the gradient of an inequality or joint limit.  Also return whether a motion can come from the inside of
+    the bound, shape (m,).  It cannot for a joint that does not move, and for a bound on a robot at rest.
     """
     model, problem = space.projector.numeric.at(q), space.problem
     limits = linearized_limits(problem, q)
-    bounded = [(limits.value, limits.posture, limits.lower, limits.upper)]
-    bounded += [(*c.evaluate(model), c.lower, c.upper) for c in problem.constraints if not c.equality]
-    value, g, lower, upper = (np.concatenate(parts) for parts in zip(*bounded, strict=True))
+    bounded = [(limits.value, limits.posture, limits.lower, limits.upper, limits.lower < limits.upper)]
+    bounded += [
+        (*c.evaluate(model), c.lower, c.upper, np.full(c.rows, not isinstance(c, Holdable | ReachableWrench)))
+        for c in problem.constraints
+        if not c.equality
+    ]
+    value, g, lower, upper, inside = (np.concatenate(parts) for parts in zip(*bounded, strict=True))
     distance = np.concatenate([upper - value, value - lower])
+    known = np.isfinite(distance)
     # At a posture that violates a bound by a rounding error, the robot can still be at rest.
-    return np.vstack([g, -g])[np.isfinite(distance)], np.maximum(distance[np.isfinite(distance)], 0.0)
+    return np.vstack([g, -g])[known], np.maximum(distance[known], 0.0), np.tile(inside, 2)[known]
 
 
 def _tipping(problem: ConstrainedProblem, model: Numeric) -> Array:
@@ -110,7 +122,8 @@ def impact_velocity(
     The velocity minimizes the largest of ``|ν_i|/ν̄_i`` and, if ``balanced``, of the shares of :func:`_tipping`, plus
     a small weight times ``Σ (ν_i/ν̄_i)²`` that makes it unique.  Entries without a limit count only in the sum, in
     rad/s or m/s.  If possible, ``q − νt`` is within inequalities and joint limits to first order, where ``t`` is the
-    ``time``, s.  If not, the smallest share of ``ν`` does not fit.  Return ``None`` if no velocity exists.
+    ``time``, s, and active bounds are not active before.  If not, the smallest share of ``ν`` does not fit.  Return
+    ``None`` if no velocity exists.
     """
     robot = spaces.run_up.problem.robot
     limited = np.isfinite(robot.velocity_limits)
@@ -126,20 +139,24 @@ def impact_velocity(
     single = np.eye(len(scale))[limited]
     tipping = _tipping(spaces.run_up.problem, Numeric(robot.model).at(q)) * scale
     shares = np.vstack([single, -single, *([tipping] if balanced else [])])
-    toward, distance = _room(spaces.run_up, q)
+    toward, distance, inside = _room(spaces.run_up, q)
     rows = np.vstack([shares, -toward * scale, np.zeros(len(scale))])
     of_share = np.repeat([1.0, 0.0], [len(shares), len(rows) - len(shares)])
     of_room = np.concatenate([np.zeros(len(shares)), distance / time, [1.0]])
-    upper = -rows @ least - np.append(np.zeros(len(rows) - 1), 1.0)
-    x, _, flag, _ = daqp.solve(
-        _UNIQUE * np.eye(N.shape[1] + 2),
-        np.append(np.zeros(N.shape[1]), [1.0, _CROWDED]),
-        np.column_stack([rows @ N, -of_share, -of_room]),
-        upper,
-        np.full_like(upper, -1e30),
-        np.zeros(len(upper), dtype=np.int32),
-    )
-    if flag != 1:
+    leave = np.concatenate([np.zeros(len(shares)), np.where(distance < _ACTIVE, inside, 0.0), [0.0]])
+    for rate in (_RATE * speed, 0.0):
+        upper = -rows @ least - np.append(np.zeros(len(rows) - 1), 1.0) - rate * leave
+        x, _, flag, _ = daqp.solve(
+            _UNIQUE * np.eye(N.shape[1] + 2),
+            np.append(np.zeros(N.shape[1]), [1.0, _CROWDED]),
+            np.column_stack([rows @ N, -of_share, -of_room]),
+            upper,
+            np.full_like(upper, -1e30),
+            np.zeros(len(upper), dtype=np.int32),
+        )
+        if flag == 1:
+            break
+    else:
         return None
     relative = least + N @ x[:-2]
     return relative * scale, float(np.abs(relative[limited]).max(initial=0.0))

@@ -103,4 +103,5 @@ class StrikeSpaces:
         J = self.approach.projector.numeric.at(start).jacobian(self._point)[:3]
         steps = (height * np.linalg.pinv(J) @ self.normal for height in _HEIGHTS)
         pulled = (self.approach.pulled(start, step) for step in steps)
-        return next((q for q in pulled if q is not None), None)
+        moved = next((q for q in pulled if q is not None), None)
+        return self.approach.apart(start) if moved is None else moved
