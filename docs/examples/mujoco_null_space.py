@@ -41,7 +41,7 @@ class Outcome:
 
     q: np.ndarray
     H: np.ndarray  # at each tick
-    error: float  # largest distance of the tool from its position, m
+    error: float  # largest distance of the tool from its position at the start, m
 
 
 def run(term: bool = True) -> Outcome:

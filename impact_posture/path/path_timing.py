@@ -61,7 +61,8 @@ def time_optimal(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> 
             discretization_scheme=DiscretizationType.Interpolation,
         ),
     ]  # fmt: skip
-    # The parameter is the path length, because TOPP-RA loses digits where the speed along the path is far from 1.
+    # The parameter is the path length, because TOPP-RA loses digits if the derivative
+    # of the posture by the parameter is far from 1.
     size = space.length([curve.at(z) for z in curve.z])
     places = np.linspace(0.0, 1.0, _GRID + 1)
     planner = TOPPRA(constraints, SplineInterpolator(size * curve.s, curve.z), gridpoints=size * places)

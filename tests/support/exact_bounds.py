@@ -6,8 +6,8 @@ to sixty digits:
 - The oracle uses Gaussian elimination with pivoting, which solves ``(K + ΔK)x = b`` with ``|ΔK| ≤ γ_3n |L||U|``
   (theorem 9.4).
 - A Cholesky factorization of ``M̃ = M + J_sᵀJ_s/ε`` solves ``(M̃ + ΔM̃)x = b`` with ``|ΔM̃| ≤ γ_(3n+1) d dᵀ``,
-  ``d_i² = M̃_ii`` (theorem 10.4).  A factorization with 1/ε added to the feet, such as the articulated bodies of the
-  kernel, cannot guarantee a smaller error.
+  ``d_i² = M̃_ii`` (theorem 10.4).  The kernel's articulated-body algorithm also adds 1/ε
+  to the feet, so it cannot guarantee a smaller error.
 
 An error bound is the size of the matrix change ``ΔK`` or ``ΔM̃`` times the condition number of the quantity.  If a
 quantity needs several solves, the sum of their bounds would be far too large.  For such a quantity, the bound is the

@@ -132,7 +132,8 @@ def _which_stick(dropped: Sequence[Dropped], rows: Sequence[Row]) -> Iterator[st
     largest = max(row.measured("restitution").max() for row in between)
     yield "MuJoCo's friction (elliptic cones) is convex: sliding lifts the contact, which Coulomb's law does not do."
     yield (
-        f"Under Coulomb's law, above, every posture rebounds with at most e = {largest:.2f}. The same postures here:"
+        f"Under Coulomb's law (tables above), the contact rebounds with at most e = {largest:.2f} at every posture. "
+        "With MuJoCo's friction, the same postures give:"
     )
     yield ""
     convex = [by.on(replace(Surface(mu), convex=True)) for by in dropped for mu in FRICTIONS if 0 < mu < np.inf]

@@ -17,8 +17,8 @@ from impact_posture.output.plot.style import AFTER_BAR, BEFORE_BAR, INK, SMALL, 
 from impact_posture.system.escape import plot_label
 
 NOTES = (
-    "∫‖ν‖dt mixes meters and radians, as in the paper. Intervals: 95 % of the mean over the seeds. The paper prints "
-    "no gains. Compare the numbers of the paper only with each other.",
+    "∫‖ν‖dt mixes meters and radians, as in the paper. Intervals: 95 % of the mean over the seeds. The paper does "
+    "not print its controller gains. Compare the numbers of the paper only with each other.",
 )
 # The axis is long enough for values of the paper up to this multiple of the largest mean.
 _FAR = 2.0

@@ -45,8 +45,8 @@ class LimitLaw:
     def __post_init__(self) -> None:
         """Raise :class:`InputError` if the law does not stop the joints."""
         if not self.rate >= 4 * self.approach:
-            what = f"rate {self.rate:g} is below four times approach {self.approach:g}"
-            raise InputError(what, where="limit law", hint="raise rate or lower approach")
+            what = f"'rate' is {self.rate:g}, below four times 'approach' ({self.approach:g})"
+            raise InputError(what, where="limit law", hint="raise 'rate' or lower 'approach'")
 
 
 class AccelerationBounds:
