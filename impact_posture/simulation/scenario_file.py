@@ -161,6 +161,11 @@ class ScenarioTable(Scene, RobotSettings):
         """Pairs (name, ``solref``) of the contact laws of the joint stops, all surfaces, and the ball."""
         return super().laws if self.throw is None else (*super().laws, ("throw", self.throw.solref))
 
+    def faced(self, shape: Shape) -> Surface | None:
+        """Return the surface that the point ``offset`` of a shape faces: for contacts, the surface that is hit."""
+        hit = self.contacts.surface if self.contacts is not None and self.contacts.frame == shape.frame else ""
+        return next((s for s in self.surfaces if s.name == hit), super().faced(shape))
+
     def __post_init__(self) -> None:
         """Check that there is exactly one task, and that its shape and its surface exist."""
         super().__post_init__()

@@ -12,6 +12,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import (
     FrameNotFound,
     ImpactPostureError,
@@ -20,6 +21,7 @@ from impact_posture.errors import (
     ScenarioNotFound,
     SpecError,
 )
+from impact_posture.impact.impact_contact import point_on
 from impact_posture.simulation.controller_gains import Gains, StanceGains
 from impact_posture.simulation.controllers.contact_reference import Reference
 from impact_posture.simulation.controllers.controller_factory import ControllerFactory
@@ -73,6 +75,15 @@ def test_every_shipped_scenario_stays_at_its_start(name: str) -> None:
     assert all(s.touching == (s.frame in feet) for s in truth.shapes)
     lifted = () if setup.scenario.control.footing is None else setup.scenario.control.footing.lifted
     assert len(driver.controller.formulation.contacts) == len(feet) and not set(lifted) & set(feet)
+
+
+def test_a_hand_touches_a_wall_with_its_contact_point() -> None:
+    """The ground is the first surface of this scenario."""
+    setup = set_up(read_scenario("g1-strike"))
+    scenario, point = setup.scenario, point_on(setup.robot, setup.scenario.shape.frame, setup.scenario.offset)
+    place = Numeric(setup.robot.model).at(setup.q).placement(point).translation
+    height = scenario.normal @ (place - setup.world.built.points["wall"])
+    assert height == pytest.approx(setup.gap, abs=1e-9) and setup.gap == pytest.approx(0.15)
 
 
 def test_pushes_have_the_values_of_the_paper() -> None:

@@ -51,7 +51,7 @@ class Shape(StrictTable):
         kind: ``sphere``, or ``box`` with its edges along the axes of the frame.
         offset: Contact point in the coordinates of the frame, m.
         center: Center of the shape in the coordinates of the frame, m.  By default, ``offset`` is the
-            point of the sphere, or the middle of the face of the box, that is nearest to the first surface in the
+            point of the sphere, or the middle of the face of the box, that is nearest to :meth:`Scene.faced` in the
             start posture.
     """
 
@@ -146,6 +146,10 @@ class Scene(StrictTable):
     def laws(self) -> tuple[tuple[str, tuple[float, float]], ...]:
         """Pairs (name, ``solref``) of the contact laws of the joint stops and of all surfaces."""
         return (("stops", self.physics.stop_solref), *((s.name, s.solref) for s in self.surfaces))
+
+    def faced(self, shape: Shape) -> Surface | None:
+        """Return the surface that the point ``offset`` of a shape faces: the first surface."""
+        return next(iter(self.surfaces), None)
 
     def __post_init__(self) -> None:
         """Check that names are unique, contact laws suit the time step, and the force sensor has a shape."""

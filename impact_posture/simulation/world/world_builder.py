@@ -81,10 +81,10 @@ def build_scene(robot: Robot, scene: Scene, q: Array, throw: Throw | None = None
     _set_passive(mjcf, robot)
     mjcf.couple_joints(robot)
     normals = {s.name: np.array(s.normal, dtype=float) / np.linalg.norm(s.normal) for s in scene.surfaces}
-    first = next(iter(normals.values()), None)
     geoms, placed = [], []
     for shape in scene.shapes:
-        placement = _placement(robot, numeric, shape, first)
+        faced = scene.faced(shape)
+        placement = _placement(robot, numeric, shape, None if faced is None else normals[faced.name])
         joint = point_on(robot, shape.frame).joint
         geoms.append(xml_name(f"shape {shape.frame}"))
         mjcf.add_geom(joint, geoms[-1], shape.kind, shape.size, placement)
