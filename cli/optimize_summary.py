@@ -48,21 +48,19 @@ def announce(page: Page, prepared: Prepared) -> None:
 
 def summarize(page: Page, prepared: Prepared, solution: PostureSolution, document: dict[str, Any]) -> None:
     """Print the result: verdict, table of values at the start and at the optimum, certificate, trade-off and path."""
-    from impact_posture.output.quantity_table import answer_key, quantity_rows
+    from impact_posture.output.quantity_table import HEAD, answer_key, quantity_rows
     from impact_posture.posture.search.impact_notes import percent
 
     initial, answer = document["initial"], document[answer_key(document)]
-    impact, blocks = prepared.impact, {"before": initial, "after": answer}
+    impact, blocks = prepared.impact, dict(zip(HEAD[1:3], (initial, answer), strict=True))
     page.line(document["verdict"]["line"], style="bold")
     page.line(document["verdict"]["minimized"])
     for line in document["verdict"]["advice"]:
         page.line(f"  {line}")
     page.gap()
-    rows = [
-        (f"  {row.key}", number(row.before), number(row.after), row.unit, row.meaning)
-        for row in quantity_rows(impact, initial, answer)
-    ]
-    page.table(("", *blocks, "unit", "meaning"), rows, right=(1, 2))
+    cells = (row.cells(number) for row in quantity_rows(impact, initial, answer))
+    rows = [(f"  {key}", *values) for key, *values in cells]
+    page.table(HEAD, rows, right=(1, 2))
     frames = contact_names(impact.objective.contacts)
     alone_line(page, frames, ", ".join(row[0].strip() for row in rows if row[0].strip() != "objective"))
     worst_tables(page, frames, blocks)
@@ -152,6 +150,8 @@ def _tradeoff(page: Page, document: dict[str, Any], notes: list[str]) -> None:
 
 
 def _path(page: Page, path: dict[str, Any]) -> None:
+    from impact_posture.path.follow_through import FACTORS, RESTITUTIONS
+
     page.gap()
     end = "the optimum" if path["found"] else f"objective {number(path['objective'])}"
     limit = path["limits"].get("active")
@@ -173,7 +173,8 @@ def _path(page: Page, path: dict[str, Any]) -> None:
         after = strike["follow_through"]
         page.line(
             f"  then stops within {number(after['longest_s'])} s after {after['stopped']} of {after['impacts']} "
-            "considered impacts (restitution 0 to 0.5, 80% to 120% of the speed)"
+            f"considered impacts (restitution {RESTITUTIONS[0]:g} to {RESTITUTIONS[-1]:g}, "
+            f"{FACTORS[0]:.0%} to {FACTORS[-1]:.0%} of the speed)"
         )
         for what, unit, room in (
             ("from a joint limit", "rad (m)", after["joints"]),

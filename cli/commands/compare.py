@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from impact_posture.config.problem_settings import JOBS
 from impact_posture_cli import options
 from impact_posture_cli.experiments import RUN, Compile, Processes, ScenarioName, Seeds, rows_table
 from impact_posture_cli.output import Page, print_json
@@ -26,7 +27,7 @@ def compare(
     scenario: ScenarioName,
     controllers: Controllers = "nominal,robust,posture",
     seeds: Seeds = 3,
-    jobs: Processes = 2,
+    jobs: Processes = JOBS,
     compile: Compile = "auto",
     out: Out = None,
     force: options.Force = False,
@@ -39,10 +40,11 @@ def compare(
     labels = [text.strip() for text in controllers.split(",") if text.strip()]
     if not labels:
         raise typer.BadParameter("name at least one controller", param_hint="--controllers")
-    from impact_posture.experiment.experiment_folders import FORMATS, Output, store_beside, write_comparison
+    from impact_posture.experiment.experiment_folders import Output, store_beside, write_comparison
     from impact_posture.experiment.jobs import controller_factory
     from impact_posture.experiment.reproduction import reproduce
     from impact_posture.experiment.seed_statistics import statistic
+    from impact_posture.output.picture_formats import DEFAULT_FORMATS
     from impact_posture.system.output_folder import check_output
 
     plan = {scenario: list(dict.fromkeys(labels))}
@@ -60,7 +62,7 @@ def compare(
                 plan, seeds=seeds, processes=jobs, store=store, progress=advance, compile=compile
             )
             if folder is not None and store is not None:
-                output = Output(folder, force, format or FORMATS, not no_report, meshes)
+                output = Output(folder, force, format or DEFAULT_FORMATS, not no_report, meshes)
                 failure = write_comparison(output, reproduction, store)
         page.warnings([failure and f"there is no report.html: {failure}"])
         if json:

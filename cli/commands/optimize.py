@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from impact_posture.config.problem_settings import ProblemSettings
+from impact_posture.config.problem_settings import JOBS, ProblemSettings
 from impact_posture_cli import options
 from impact_posture_cli.optimize_summary import announce, summarize
 from impact_posture_cli.output import Page, print_json
@@ -34,7 +34,7 @@ RobotOrProblem = Annotated[
 def optimize(
     typed: TypedSettings,
     robot: RobotOrProblem,
-    jobs: options.Jobs = 2,
+    jobs: options.Jobs = JOBS,
     compile: options.Compile = "auto",
     out: options.Out = None,
     force: options.Force = False,
@@ -51,7 +51,8 @@ def optimize(
     _refuse_idle(typed, settings)
     from impact_posture.api.posture_problem import PostureProblem
     from impact_posture.api.posture_result import optimize as solve
-    from impact_posture.output.result_folder import FORMATS, default_out
+    from impact_posture.output.picture_formats import DEFAULT_FORMATS
+    from impact_posture.output.result_folder import default_out
     from impact_posture.posture.formulation.problem_file import dump_settings, prepare, resolved_settings
     from impact_posture.system.output_folder import check_output
 
@@ -98,7 +99,7 @@ def optimize(
             folder,
             force=force,
             codegen=not no_codegen,
-            formats=format or FORMATS,
+            formats=format or DEFAULT_FORMATS,
             report=not no_report,
             meshes=meshes,
             jobs=jobs,

@@ -32,13 +32,13 @@ def plot(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
+    from impact_posture.output.picture_formats import DEFAULT_FORMATS
     from impact_posture.output.plot import draw_into
-    from impact_posture.output.result_folder import FORMATS
     from impact_posture.output.result_reader import load_view
 
     folder = Path(result_dir)
     into = Path(out) if out else folder
-    formats = format or FORMATS
+    formats = format or DEFAULT_FORMATS
     page = Page(json=json, quiet=quiet)
     with page.progress("drawing"):
         written = draw_into(load_view(folder), into, formats, figure, force=force)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
+from impact_posture.config.problem_settings import JOBS
 from impact_posture_cli import options
 from impact_posture_cli.experiments import RUN, Compile, Processes, Seeds, rows_table
 from impact_posture_cli.output import Page, print_json
@@ -18,7 +19,7 @@ Out = Annotated[str, options.out_option("Folder of the results.")]
 
 def reproduce(
     seeds: Seeds = 10,
-    jobs: Processes = 2,
+    jobs: Processes = JOBS,
     compile: Compile = "auto",
     all_: All = False,
     scenario: Scenarios = None,
@@ -29,10 +30,11 @@ def reproduce(
     quiet: options.Quiet = False,
 ) -> None:
     from impact_posture.errors import ScenarioNotFound
-    from impact_posture.experiment.experiment_folders import FORMATS, Output, store_beside, write_reproduction
+    from impact_posture.experiment.experiment_folders import Output, store_beside, write_reproduction
     from impact_posture.experiment.reproduction import PAPER, controllers_of
     from impact_posture.experiment.reproduction import reproduce as reproduce_all
     from impact_posture.experiment.reproduction_summary import advice
+    from impact_posture.output.picture_formats import DEFAULT_FORMATS
     from impact_posture.system.output_folder import check_output
 
     scenarios = list(dict.fromkeys(scenario)) if scenario else list(PAPER)
@@ -48,7 +50,7 @@ def reproduce(
             reproduction = reproduce_all(
                 plan, seeds=seeds, processes=jobs, store=store, progress=advance, compile=compile
             )
-            document = write_reproduction(Output(folder, force, format or FORMATS), reproduction, store)
+            document = write_reproduction(Output(folder, force, format or DEFAULT_FORMATS), reproduction, store)
         if json:
             print_json(document)
             return

@@ -76,9 +76,10 @@ def simulate(
 
     # Read the scenario before the slow imports, so that a wrong name is reported at once.
     experiment = read_scenario(scenario)
-    from impact_posture.experiment.experiment_folders import FORMATS, Output, write_simulation
+    from impact_posture.experiment.experiment_folders import Output, write_simulation
     from impact_posture.experiment.jobs import Job, controller_factory, execute, worth_compiling
     from impact_posture.experiment.seed_statistics import fate
+    from impact_posture.output.picture_formats import DEFAULT_FORMATS
     from impact_posture.posture.program.ipopt import one_blas_thread
     from impact_posture.simulation.controllers.controller_factory import check_gain
     from impact_posture.system.escape import file_name
@@ -99,7 +100,7 @@ def simulate(
     with page.progress("running"):
         with one_blas_thread():
             runs, document = execute(job, factory)
-        output = Output(folder, force, format or FORMATS, not no_report, meshes)
+        output = Output(folder, force, format or DEFAULT_FORMATS, not no_report, meshes)
         failure = write_simulation(output, job, runs, document)
     page.warnings([failure and f"there is no report.html: {failure}"])
     if json:

@@ -13,9 +13,11 @@ import numpy as np
 from impact_posture.api.posture_problem import PostureProblem
 from impact_posture.config.checked import checked
 from impact_posture.config.demand import OneOrMore, ZeroOrMore
-from impact_posture.config.problem_settings import SCREENED, STARTS, TRADEOFF_POINTS, Against, Search
+from impact_posture.config.problem_settings import JOBS, SCREENED, STARTS, TRADEOFF_POINTS, Against, Search
 from impact_posture.errors import Infeasible, InputError
-from impact_posture.output.result_folder import FORMATS, Written, finish_result
+from impact_posture.impact.elasticity.contact_compression import GIVE_ELASTICITY
+from impact_posture.output.picture_formats import DEFAULT_FORMATS
+from impact_posture.output.result_folder import Written, finish_result
 from impact_posture.output.result_reader import SolvedPostures, result_view
 from impact_posture.posture.analysis.least_force import explain_force_bound
 from impact_posture.posture.analysis.pareto_front import pareto_front
@@ -158,8 +160,7 @@ class PostureResult:
             impact = self._prepared.impact
             if impact.contact_stiffness is None:
                 fault = "force needs the elasticity of the contact"
-                hint = "add `contact_stiffness` (N/m, or a material) or `contact_duration`"
-                raise InputError(fault, where="tradeoff_against", hint=hint)
+                raise InputError(fault, where="tradeoff_against", hint=GIVE_ELASTICITY)
             force = impact.contact_stiffness, impact.speed
         curve = pareto_front(self.solution, points, force=force, compile=compile, progress=progress)
         return replace(self, tradeoff=curve)
@@ -195,10 +196,10 @@ class PostureResult:
         *,
         force: bool = False,
         codegen: bool = True,
-        formats: Sequence[str] = FORMATS,
+        formats: Sequence[str] = DEFAULT_FORMATS,
         report: bool = True,
         meshes: bool = False,
-        jobs: OneOrMore = 2,
+        jobs: OneOrMore = JOBS,
         progress: Progress | None = None,
     ) -> Written:
         """Write a folder with result.json, problem.toml, posture.json, pictures and C code, or write nothing.
@@ -240,7 +241,7 @@ class PostureResult:
 
     @checked
     def plot(
-        self, out: str | Path, formats: Sequence[str] = FORMATS, only: Sequence[str] | None = None, *,
+        self, out: str | Path, formats: Sequence[str] = DEFAULT_FORMATS, only: Sequence[str] | None = None, *,
         force: bool = False,
     ) -> list[Path]:  # fmt: skip
         """Draw the figures into a folder, and return their paths.  With ``force``, replace files of the user too.
@@ -268,7 +269,7 @@ def optimize(
     *,
     starts: OneOrMore | None = None,
     seed: ZeroOrMore = 0,
-    jobs: OneOrMore = 2,
+    jobs: OneOrMore = JOBS,
     compile: CompileMode = "auto",
     search: Search = "adaptive",
     progress: Progress | None = None,

@@ -16,7 +16,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from impact_posture.codegen.c_emitter import SHORT_NAMES
 from impact_posture.codegen.c_literals import DOUBLE, Real, brace_initializer
 from impact_posture.codegen.c_source import CSource
-from impact_posture.codegen.export_functions import SIGNATURES, lengths
+from impact_posture.codegen.export_functions import BLOCK_THREADS, SIGNATURES, lengths
 from impact_posture.codegen.export_library import NamedObjective
 from impact_posture.codegen.manifest_reader import identity
 from impact_posture.codegen.self_test import self_test_tolerance
@@ -26,8 +26,6 @@ from impact_posture.system.escape import c_comment, markdown
 from impact_posture.version import __version__
 
 _WIDTH = 112
-# Number of threads in a block of the CUDA kernels.  On an H100, the speed is nearly the same from 32 to 256.
-_THREADS = 128
 
 
 class Verbatim(str):
@@ -172,7 +170,7 @@ def _context(
         "units": units,
         "unit_bounds": [real.literal(float(f"{(1 + sign * real.unit_tolerance) ** 2:.12f}")) for sign in (-1, 1)],
         "macros": SHORT_NAMES,
-        "block": _THREADS,
+        "block": BLOCK_THREADS,
         "signatures": SIGNATURES,
         "sizes": sizes,
         "kernels": [

@@ -63,10 +63,14 @@ MATERIALS = {"steel": (200e9, 0.28), "wood": (11.5e9, 0.3), "rubber": (0.03e9, 0
 # Default least distance (m) between links that must not touch.  Default edge length (m) of a square surface, which
 # replaces the endless plane if a foot or a fixed base is behind this plane.
 CLEARANCE, PATCH = 0.001, 0.3
-# Default friction coefficient (Coulomb).
+# Default half extents (m) of the boxes in which the contact frame and the base stay.
+BOX, BASE_BOX = (0.05, 0.05, 0.05), (0.2, 0.2, 0.2)
+# Default friction coefficient (Coulomb), also of the contacts of the online controller.
 FRICTION = Unstated(0.7)
 # Default number of starts of a multi-start search, and of random postures that the adaptive search screens at most.
 STARTS, SCREENED = 16, 6144
+# Default number of processes of a search, and of the runs of an experiment.
+JOBS = 2
 # Number of bounds if --tradeoff is given without a number.
 TRADEOFF_POINTS = 16
 # Default approach speed (m/s), and default coefficient of restitution, of predicted impacts.
@@ -209,7 +213,7 @@ class ProblemSettings(ImpactSettings):
         None, "Hold the contact frame: full, position, aligned, aligned:DEG, free or box.", TASK, "KIND",
         "from robot.toml, else full",
     )  # fmt: skip
-    box: Lengths = setting((0.05, 0.05, 0.05), "Half extents of --contact-pose box, m.", TASK, "X Y Z")
+    box: Lengths = setting(BOX, "Half extents of --contact-pose box, m.", TASK, "X Y Z")
     keep: tuple[str, ...] = setting((), "Hold the pose of another frame; repeatable.", TASK, "FRAME", repeatable=True)
     hold: tuple[str, ...] | None = setting(
         None, "Keep a joint at its value; replaces the joints in robot.toml; repeatable.", TASK, "JOINT",
@@ -219,7 +223,7 @@ class ProblemSettings(ImpactSettings):
         None, "Hold a floating base: free, level, level:DEG, fixed or box.", TASK, "KIND",
         "from robot.toml, else free",
     )  # fmt: skip
-    base_box: Lengths = setting((0.2, 0.2, 0.2), "Half extents of --base box, m.", TASK, "X Y Z")
+    base_box: Lengths = setting(BASE_BOX, "Half extents of --base box, m.", TASK, "X Y Z")
     com: bool | None = setting(
         None, "Keep the center of mass above the feet.", LIMITS, words="from robot.toml", option="--com/--no-com"
     )

@@ -32,6 +32,7 @@ from impact_posture.robot.robot import Robot
 from impact_posture.system.libraries import library_path
 from impact_posture.system.output_folder import whole_folder, write_whole
 from impact_posture.system.toolchain import find_compiler
+from impact_posture.tsid.state import PERIOD
 from impact_posture.tsid.task_formulation import TaskFormulation
 from impact_posture.version import __version__
 
@@ -75,7 +76,7 @@ def export_controller(
     *,
     objective: WorstCaseObjective | None = None,
     prefix: str | None = None,
-    period: float = 1e-3,
+    period: float = PERIOD,
     daqp: str | Path | None = None,
     build: bool = False,
     force: bool = False,

@@ -14,13 +14,13 @@ from impact_posture.experiment.jobs import Document, Job
 from impact_posture.experiment.reproduction import PAPER, Reproduction
 from impact_posture.experiment.reproduction_summary import summary
 from impact_posture.experiment.run_reports import COMPARISON, SIMULATION, keep_runs, run_view, stored_run, try_report
+from impact_posture.output.picture_formats import DEFAULT_FORMATS
 from impact_posture.output.plot import Bar, bars_figure, figures_of_comparison, figures_of_run, save, save_all
 from impact_posture.simulation.run import Run
 from impact_posture.system.output_folder import whole_folder, write_json
 from impact_posture.system.progress import tell
 
 REPRODUCTION = "reproduction.json"
-FORMATS = ("png",)
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Output:
 
     folder: Path
     force: bool = False
-    formats: Sequence[str] = FORMATS
+    formats: Sequence[str] = DEFAULT_FORMATS
     report: bool = True
     meshes: bool = False
 

@@ -192,7 +192,7 @@ class Reproduction:
 def reproduce(
     plan: Plan,
     *,
-    seeds: int = 10,
+    seeds: int,
     processes: int = 1,
     store: JobStore | None = None,
     progress: Progress | None = None,

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from impact_posture.codegen.export_functions import BLOCK_THREADS
 from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.config.checked import checked
 from impact_posture.errors import InputError, SpecError
@@ -26,8 +27,6 @@ if TYPE_CHECKING:
 
 # DLPack's number of a CUDA device.
 _CUDA = 2
-# Threads of a block.  On an H100, the speed is nearly the same from 32 to 256.
-_THREADS = 128
 # Last words of the names of a joint's entries in q → how many entries it has in ν.
 _JOINTS = {
     ("x (m)", "y (m)", "z (m)", "qx", "qy", "qz", "qw"): 6,
@@ -125,7 +124,7 @@ class BatchMetric:
             header = self._folder / f"{self.gradient.manifest['prefix']}.cuh"
             if not header.is_file():
                 raise InputError("has no CUDA code", where=str(self._folder), hint="export it with `cuda`")
-            expression = f"{self.gradient.symbols[key[0]]}_kernel<{_THREADS}>"
+            expression = f"{self.gradient.symbols[key[0]]}_kernel<{BLOCK_THREADS}>"
             code, options = read_text(header), ("-std=c++17",)
             module = cupy.RawModule(code=code, options=options, backend="nvrtc", name_expressions=(expression,))
             kernel = self._kernels[key] = module.get_function(expression)
@@ -136,7 +135,7 @@ class BatchMetric:
         grad = cupy.empty((count, self.gradient.nv), dtype=self.gradient.dtype)
         if count:
             # The last argument is a null pointer in place of the array of return codes.
-            kernel((-(-count // _THREADS),), (_THREADS,), (q, *normals, np.int32(count), value, grad, 0))
+            kernel((-(-count // BLOCK_THREADS),), (BLOCK_THREADS,), (q, *normals, np.int32(count), value, grad, 0))
         return value, grad
 
     def _normalized(self, xp: Any, q: Any) -> tuple[Any, Any]:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
     from impact_posture.impact.metric import Metric
     from impact_posture.impact.resolved_impact import ResolvedImpact
+
+HEAD = ("", "before", "after", "unit", "meaning")
+"""Headers of the table."""
 
 
 class QuantityRow(NamedTuple):
@@ -20,6 +24,10 @@ class QuantityRow(NamedTuple):
     after: float | None
     unit: str
     meaning: str
+
+    def cells(self, number: Callable[[float | None], str]) -> tuple[str, ...]:
+        """Return the row as texts in the order of :data:`HEAD`; ``number`` writes a value."""
+        return self.key, number(self.before), number(self.after), self.unit, self.meaning
 
 
 def quantities(metric: Metric) -> list[tuple[str, str, str]]:

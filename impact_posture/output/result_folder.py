@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from impact_posture.codegen.export import Export
     from impact_posture.output.report.report_scene import ReportScene
 
-FORMATS = ("png",)
-
 
 @dataclass(frozen=True)
 class Written:

@@ -8,6 +8,9 @@ from typing import Annotated, Literal
 from impact_posture.config.checked import checked
 from impact_posture.config.demand import Demand, NonNegative, Positive, between
 from impact_posture.config.table_validation import StrictTable
+from impact_posture.tsid.state import PERIOD
+from impact_posture.tsid.tasks.activation import RAMP
+from impact_posture.tsid.tasks.impact_robust import FADE
 
 EndEffectorPose = Literal["full", "position", "aligned"]
 OneOrEach = Positive | Annotated[tuple[Positive, ...], Demand(lambda values: len(values) > 0, "numbers above zero")]
@@ -55,8 +58,8 @@ class RobustTerm(StrictTable):
     """
 
     gain: Positive
-    ramp: Positive = 0.3
-    fade: tuple[NonNegative, Positive] = (0.05, 0.2)
+    ramp: Positive = RAMP
+    fade: tuple[NonNegative, Positive] = FADE
 
 
 @checked
@@ -97,7 +100,7 @@ class Control(StrictTable):
 
     posture: Gains
     robust: RobustTerm
-    period: Annotated[float, between(1e-12, 3600, "s")] = 1e-3
+    period: Annotated[float, between(1e-12, 3600, "s")] = PERIOD
     tilt: Gains | None = None
     end_effector: EndEffectorGains | None = None
     apparent_mass: Positive | None = None

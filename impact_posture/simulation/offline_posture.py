@@ -24,6 +24,8 @@ from impact_posture.tsid.flow.flow_direction import FlowOptions
 
 # Holding the posture may need at most this share of the limits of motors and rotors.
 SHARE = 0.8
+# Default number of starts.
+OFFLINE_STARTS = 8
 # Weight of the squared distance from the start, relative to the objective at the start.  With this weight, a humanoid
 # moves half as far, and its objective is 1 % larger.  The humanoid thus avoids postures in which its controller loads
 # the legs unevenly.
@@ -64,7 +66,12 @@ class OfflinePosture:
 
 
 def offline_posture(
-    setup: Setup, objective: WorstCaseObjective, *, starts: int = 8, at_contact: bool = True, keep_feet: bool = False
+    setup: Setup,
+    objective: WorstCaseObjective,
+    *,
+    starts: int = OFFLINE_STARTS,
+    at_contact: bool = True,
+    keep_feet: bool = False,
 ) -> OfflinePosture:
     """Optimize the posture for the impact of a scenario.
 

@@ -20,7 +20,7 @@ from impact_posture.tsid.flow.reference_flow_posture import ReferenceFlowPosture
 from impact_posture.tsid.qp.daqp_solver import DaqpSolver, WhitenedSolver
 from impact_posture.tsid.qp.quadratic_program import EQUALITY
 from impact_posture.tsid.relaxation import Outcome, Relaxed, missed, solve
-from impact_posture.tsid.state import State, checked_velocity
+from impact_posture.tsid.state import PERIOD, State, checked_velocity
 from impact_posture.tsid.task_formulation import TaskFormulation
 from impact_posture.tsid.tasks.impact_robust import ImpactRobustPosture
 from impact_posture.tsid.tasks.task import Task
@@ -117,7 +117,7 @@ class Controller:
         assembly: Buffers of the QP.
     """
 
-    def __init__(self, robot: Robot, formulation: TaskFormulation, *, period: Positive = 1e-3) -> None:
+    def __init__(self, robot: Robot, formulation: TaskFormulation, *, period: Positive = PERIOD) -> None:
         """Size all buffers.
 
         ``period``, s, is the first time step of ramps.  Later time steps are at most ten times ``period``.

@@ -14,6 +14,9 @@ from impact_posture.system.arrays import Array
 from impact_posture.tsid.joint_ranges import JointRanges
 from impact_posture.tsid.point_kinematics import Point, PointKinematics, PointState
 
+# Default time between two ticks, s.
+PERIOD = 1e-3
+
 
 class State:
     """``M``, ``h``, point Jacobians, drifts and center of mass at the configuration ``q`` and the velocity ``ν``.

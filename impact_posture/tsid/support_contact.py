@@ -11,7 +11,7 @@ import pinocchio as pin
 
 from impact_posture.config.checked import checked
 from impact_posture.config.demand import NonNegative, Positive
-from impact_posture.config.problem_settings import SupportKind
+from impact_posture.config.problem_settings import FRICTION, SupportKind
 from impact_posture.errors import ContactError
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
@@ -43,7 +43,7 @@ class SupportContact:
     kind: SupportKind = "point"
     half: tuple[float, float] = (0.0, 0.0)
     normal: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    friction: Positive = 0.7
+    friction: Positive = FRICTION
     least: NonNegative = 1.0
     kp: NonNegative = 100.0
     kd: NonNegative = 20.0
@@ -78,7 +78,7 @@ class SupportContact:
 
 
 @checked
-def support_contacts(robot: Robot, *, friction: Positive = 0.7) -> tuple[SupportContact, ...]:
+def support_contacts(robot: Robot, *, friction: Positive = FRICTION) -> tuple[SupportContact, ...]:
     """Return the supports of ``robot.toml`` as contacts on level ground.
 
     ``friction`` is the Coulomb coefficient.  Soles are hard constraints; point contacts have a weight in the cost.

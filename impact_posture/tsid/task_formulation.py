@@ -7,6 +7,7 @@ from typing import Literal
 
 from impact_posture.config.checked import checked
 from impact_posture.config.demand import Positive
+from impact_posture.config.problem_settings import FRICTION
 from impact_posture.errors import InputError
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
@@ -149,7 +150,7 @@ def legged_formulation(
     posture: JointPosture,
     *,
     kp: Positive = 20.0,
-    friction: Positive = 0.7,
+    friction: Positive = FRICTION,
     center_of_mass: CenterOfMass | None = None,
     base: BaseOrientation | None = None,
     contacts: tuple[SupportContact, ...] | None = None,

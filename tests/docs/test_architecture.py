@@ -57,8 +57,8 @@ def test_no_folder_is_crowded() -> None:
 @pytest.mark.skipif(not (ROOT / "docs").is_dir(), reason="not in a checkout")
 def test_the_index_of_the_code_names_files_that_exist() -> None:
     page = (ROOT / "docs" / "developer.md").read_text(encoding="utf-8")
-    named = {Path(name) for name in re.findall(r"`([\w/]+\.py)`", page)}
-    known = [path for folder in ("impact_posture", "cli", "tests") for path in (ROOT / folder).rglob("*.py")]
+    named = {Path(name) for name in re.findall(r"`([\w/.]+\.(?:py|c|css|js|jinja))`", page)}
+    known = [path for folder in ("impact_posture", "cli", "tests", "docs") for path in (ROOT / folder).rglob("*.*")]
     assert len(named) > 100
     assert [str(name) for name in named if not any(p.parts[-len(name.parts) :] == name.parts for p in known)] == []
 

@@ -44,6 +44,8 @@ _TIP_ONLY = f"a flat or padded tool touches longer than the assumed steel tip of
 _MOVED = 0.1
 # For x up to SHORT, only the links respond.  For x from LONG, the rotors respond too (docs: which inertia).
 SHORT, LONG = 0.2, 0.75
+GIVE_ELASTICITY = "add `contact_stiffness` (N/m, or a material) or `contact_duration`"
+"""Hint of the errors about an unknown elasticity of the contact."""
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from impact_posture.config.json_block import JsonBlock
 from impact_posture.config.problem_settings import RESTITUTION, SPEED
 from impact_posture.errors import InputError, MetricError
 from impact_posture.impact.elasticity.contact_compression import (
+    GIVE_ELASTICITY,
     Compression,
     ContactStiffness,
     both_models,
@@ -264,8 +265,8 @@ def _elastic(
     if objective.robot.joint_model != "elastic":
         return None
     if contact is None:
-        hint = "add `contact_stiffness` (N/m, or a material) or `contact_duration`"
-        raise InputError("elastic needs the elasticity of the contact", where="joint_model", hint=hint)
+        what = "elastic needs the elasticity of the contact"
+        raise InputError(what, where="joint_model", hint=GIVE_ELASTICITY)
     # The elastic response has no friction, so the contact is matched to the effective mass without friction.
     stiffness = contact.linear_stiffness(1 / objective.oracle.quantities(q).G, speed)
     return ElasticImpact(objective.case).response(q, stiffness, speed)

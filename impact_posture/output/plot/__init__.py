@@ -15,6 +15,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from impact_posture.errors import NameNotFound
+from impact_posture.output.picture_formats import DEFAULT_FORMATS, FORMATS, check_formats
 from impact_posture.output.plot import (
     classical_figure,
     ellipsoid_figure,
@@ -27,7 +28,7 @@ from impact_posture.output.plot.postures_figure import postures_figure
 from impact_posture.output.plot.result_view import ResultView, TradeOffData
 from impact_posture.output.plot.run_figures import figures_of_comparison, figures_of_run
 from impact_posture.output.plot.run_view import RunView
-from impact_posture.output.plot.style import DEFAULT_FORMATS, FORMATS, check_formats, save, save_all
+from impact_posture.output.plot.style import save, save_all
 from impact_posture.system.output_folder import added_files
 
 __all__ = [

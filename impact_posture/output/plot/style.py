@@ -19,7 +19,8 @@ from matplotlib.textpath import text_to_path
 from matplotlib.transforms import Bbox
 from PIL import Image
 
-from impact_posture.errors import InputError, OutputError, printable
+from impact_posture.errors import OutputError, printable
+from impact_posture.output.picture_formats import DEFAULT_FORMATS, check_formats
 from impact_posture.output.plot.labels import draw_with_labels
 from impact_posture.output.plot.result_view import SEPARATOR
 from impact_posture.system.output_folder import check_name
@@ -50,9 +51,6 @@ SHADES: dict[str, dict[str, Any]] = {
 BAND: dict[str, Any] = {"facecolor": "#dcdcdc", "edgecolor": "none", "zorder": 1.2}
 START: dict[str, Any] = {"color": "#a9a9a9", "linestyle": "-", "linewidth": 1.0, "zorder": 2.0}
 
-FORMATS = ("png", "svg", "pdf")
-# A PDF takes as long as three PNG files.
-DEFAULT_FORMATS = ("png",)
 # Width of a two-column page, inches.
 WIDTH = 7.2
 # Font sizes, points: text, legends, small print and tick numbers, and tick numbers in 3-D.
@@ -199,15 +197,6 @@ def _measure_once(axes: Any) -> None:
         return box
 
     axes.get_tightbbox = get_tightbbox
-
-
-def check_formats(formats: Iterable[str]) -> tuple[str, ...]:
-    """Return the formats in lower case and without duplicates; raise ``InputError`` for an unknown format."""
-    wanted = tuple(dict.fromkeys(f.lower().lstrip(".") for f in formats))
-    for extension in wanted:
-        if extension not in FORMATS:
-            raise InputError(f"no format '{extension}'", where="plot", hint=f"choose from {', '.join(FORMATS)}")
-    return wanted
 
 
 def save_all(figures: Mapping[str, Figure], out_dir: Path, formats: Iterable[str] = DEFAULT_FORMATS) -> list[Path]:

@@ -15,7 +15,7 @@ from impact_posture.impact.evaluation.velocity_jump import normal_jump
 from impact_posture.impact.impact_contact import point_on
 from impact_posture.output.plot import draw_all
 from impact_posture.output.plot.result_view import ALONE, SEPARATOR, ResultView, contact_speeds, header_lines, number
-from impact_posture.output.quantity_table import QuantityRow, answer_key, quantities, quantity_rows
+from impact_posture.output.quantity_table import HEAD, QuantityRow, answer_key, quantities, quantity_rows
 from impact_posture.output.report.drawn_robot import draw_robot
 from impact_posture.output.report.report_page import Content, Table, figures, render_summary, write_page
 from impact_posture.output.report.report_scene import Curve, ReportScene, Track, impact_curves
@@ -202,8 +202,8 @@ def _before_and_after(prepared: Prepared, document: dict[str, Any]) -> Iterator[
         alone += "; the objective is of all contacts" if alone and k == 0 else ""
         yield Table(
             f"Before and after{alone}",
-            ("", "before", "after", "unit", "meaning"),
-            tuple((row.key, number(row.before), number(row.after), row.unit, row.meaning) for row in rows),
+            HEAD,
+            tuple(row.cells(number) for row in rows),
         )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+from impact_posture.config.problem_settings import JOBS
 from impact_posture.errors import ImpactPostureError, Infeasible
 from impact_posture.posture.formulation.build_problem import build_problem
 from impact_posture.posture.formulation.problem_file import Prepared
@@ -19,7 +20,7 @@ def least_effective_mass(
     *,
     starts: int,
     seed: int = 0,
-    jobs: int = 2,
+    jobs: int = JOBS,
     compile: CompileMode = "auto",
     guesses: Sequence[Array] = (),
 ) -> PostureSolution:

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from impact_posture.config.json_block import JsonBlock
-from impact_posture.config.problem_settings import STARTS
+from impact_posture.config.problem_settings import JOBS, STARTS
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import Infeasible, SolverFailed
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
@@ -127,7 +127,7 @@ def solve_robustly(
     *,
     starts: int = STARTS,
     seed: int = 0,
-    jobs: int = 2,
+    jobs: int = JOBS,
     compile: CompileMode = "auto",
     progress: Progress | None = None,
     finish_all: bool = False,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from impact_posture.config.checked import checked
 from impact_posture.config.demand import Lengths, NonNegative, Position, UnitQuaternion
 from impact_posture.config.obstacle import Obstacle
-from impact_posture.config.problem_settings import CLEARANCE
+from impact_posture.config.problem_settings import BASE_BOX, BOX, CLEARANCE, FRICTION
 
 
 @checked
@@ -58,16 +58,16 @@ class Requirements:
     other_poses: tuple[str, ...] = ()
     target_position: Position | None = None
     target_quaternion: UnitQuaternion | None = None
-    box: Lengths = (0.05, 0.05, 0.05)
+    box: Lengths = BOX
     base: str = "free"
-    base_box: Lengths = (0.2, 0.2, 0.2)
+    base_box: Lengths = BASE_BOX
     keep: tuple[str, ...] = ()
     hold: tuple[str, ...] = ()
     com_over_feet: bool = False
     com_asked: bool = True
     com_margin: NonNegative = 0.0
     keep_contacts: bool = False
-    friction: NonNegative = 0.7
+    friction: NonNegative = FRICTION
     holdable: bool = False
     limit_share: float = 1.0
     hold_force: float = 0.0

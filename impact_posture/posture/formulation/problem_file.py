@@ -12,7 +12,7 @@ from impact_posture.config.problem_settings import ProblemSettings
 from impact_posture.config.setting import stated
 from impact_posture.config.table_validation import read_toml, validate
 from impact_posture.errors import InputError, SpecError
-from impact_posture.impact.elasticity.contact_compression import ContactStiffness
+from impact_posture.impact.elasticity.contact_compression import GIVE_ELASTICITY, ContactStiffness
 from impact_posture.impact.evaluation.velocity_jump import normal_jump
 from impact_posture.impact.objective import Objective
 from impact_posture.impact.resolved_impact import FLOATS, ResolvedImpact, resolve
@@ -152,9 +152,7 @@ def _largest_mass(settings: ProblemSettings) -> float:
         ("tradeoff_against", settings.tradeoff > 0 and settings.tradeoff_against == "force"),
     ):
         if asked and settings.contact_stiffness is None and settings.contact_duration is None:
-            fault = "needs the elasticity of the contact"
-            hint = "add `contact_stiffness` (N/m, or a material) or `contact_duration`"
-            raise InputError(fault, where=name, hint=hint)
+            raise InputError("needs the elasticity of the contact", where=name, hint=GIVE_ELASTICITY)
         if asked and settings.speed == 0:
             raise InputError("needs an approach speed", where=name, hint="give `speed` above zero")
     contact = ContactStiffness.of(settings.contact_stiffness, settings.contact_duration)

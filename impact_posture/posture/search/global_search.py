@@ -14,6 +14,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from impact_posture.config.problem_settings import JOBS
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import InputError, SolverFailed
 from impact_posture.posture.manifold.constraint_manifold import ConstraintManifold
@@ -151,7 +152,7 @@ def search_globally(
     solution: PostureSolution,
     *,
     seed: int = 0,
-    jobs: int = 2,
+    jobs: int = JOBS,
     compile: CompileMode = "auto",
 ) -> GlobalSolution:
     """Continue from the solution of a search whose problem passes :func:`check_searchable`.

@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.config.json_block import JsonBlock
-from impact_posture.config.problem_settings import STARTS
+from impact_posture.config.problem_settings import JOBS, STARTS
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import SolverFailed
@@ -108,7 +108,7 @@ def solve(
     *,
     starts: int = STARTS,
     seed: int = 0,
-    jobs: int = 2,
+    jobs: int = JOBS,
     compile: CompileMode = "auto",
     progress: Progress | None = None,
     guesses: Sequence[Array] = (),

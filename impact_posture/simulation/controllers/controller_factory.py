@@ -33,7 +33,7 @@ from impact_posture.simulation.controllers.impact_baselines import (
 )
 from impact_posture.simulation.controllers.strike_driver import StrikeDriver
 from impact_posture.simulation.controllers.task_formulations import nominal_posture, posture_options
-from impact_posture.simulation.offline_posture import OfflinePosture, offline_posture
+from impact_posture.simulation.offline_posture import OFFLINE_STARTS, OfflinePosture, offline_posture
 from impact_posture.simulation.scenario_objective import Gradient, compiled, interpreted, scenario_objective
 from impact_posture.simulation.setup import Setup
 from impact_posture.system.arrays import Array
@@ -120,7 +120,7 @@ class ControllerFactory:
     gradient_of: Callable[[WorstCaseObjective], Gradient] = compiled
     offline_of: Callable[..., OfflinePosture] = offline_posture
     compile: CompileMode = "never"
-    starts: int = 8
+    starts: int = OFFLINE_STARTS
     in_c: bool = False
     warnings: list[str] = field(default_factory=list)
     _fault: str = ""

@@ -12,7 +12,7 @@ from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 from impact_posture.tsid.joint_ranges import JointRanges
 from impact_posture.tsid.point_kinematics import Point
-from impact_posture.tsid.state import State
+from impact_posture.tsid.state import PERIOD, State
 from impact_posture.tsid.support_contact import SupportContact
 
 # Singular values of a contact Jacobian below this share of the largest singular value are treated as zero.
@@ -76,7 +76,7 @@ class ImpactLimits:
         point: Point,
         normal: ArrayLike,
         contacts: Sequence[SupportContact] = (),
-        period: float = 1e-3,
+        period: float = PERIOD,
     ) -> None:
         self._first = robot.first_joint
         self._torque = torque_limits(robot.model)[self._first :]

@@ -9,6 +9,9 @@ from impact_posture.config.demand import Positive
 from impact_posture.errors import InputError
 from impact_posture.tsid.smooth_step import smooth
 
+# Default time in which the level changes from 0 to 1, s.
+RAMP = 0.3
+
 
 class Phase(Enum):
     """Phase of the controller around an anticipated impact."""
@@ -43,7 +46,7 @@ class Activation:
         goal: Final level in the present phase.
     """
 
-    def __init__(self, *, ramp: Positive = 0.3, live: bool = False) -> None:
+    def __init__(self, *, ramp: Positive = RAMP, live: bool = False) -> None:
         self.ramp, self.live = ramp, live
         self.reset()
 

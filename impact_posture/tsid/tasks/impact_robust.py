@@ -29,6 +29,8 @@ Spring = Literal["keep", "release", "follow"]
 _STEP = 1e-5
 # Lower bound on the curvature scale ``λ``, as a share of H, per rad².
 _FLAT = 1e-3
+# Default distances from a position limit between which the term fades out, rad (m).
+FADE = (0.05, 0.2)
 
 
 def gradient_of(export: ImpactGradient, normal: ArrayLike | None = None) -> Gradient:
@@ -112,7 +114,7 @@ class ImpactRobustPosture(JointPosture):
         spring: Spring = "keep",
         follow: Positive = 0.5,
         reach: Positive = 2.0,
-        fade: _Fade = (0.05, 0.20),
+        fade: _Fade = FADE,
         every: OneOrMore = 5,
         scale: Positive | None = None,
         activation: Activation | None = None,
