@@ -16,9 +16,9 @@ from impact_posture.path.timed_curve import moment
 from impact_posture.posture.approach.attainable_speed import RUN_UP
 from impact_posture.system.arrays import Array
 
-# Lengths of a stroke, s, measured as the time at the velocity of the impact.  The second length is used if the first
-# is too short.
-_SHORT, _LONG = 0.1, 0.5
+# Lengths of a stroke, s, measured as the time at the velocity of the impact.  A length is used if the shorter lengths
+# do not suffice.
+_LENGTHS = (0.1, 0.5, 1.5)
 # Tangent length between two knots of a stroke, and largest tangent length, rad mixed with m.
 _KNOTS, _FARTHEST = STEP / 2, 1.5
 # Least tangent speed with which a curve is computed, rad/s mixed with m/s.
@@ -171,7 +171,7 @@ def shortest_stroke(
     factor: float = 1.0,
 ) -> tuple[Stroke, float | None]:
     """Return a stroke and its shortest duration within the limits, s; ``None`` if it has none."""
-    for time in (_SHORT, _LONG):
+    for time in _LENGTHS:
         stroke = Stroke(space, q, u, rows, time, before=before)
         duration = None if stroke.curve is None else stroke.shortest(limits, factor)
         if duration is not None or stroke.end:

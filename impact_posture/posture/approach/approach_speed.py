@@ -111,7 +111,7 @@ class ApproachSpeed(Constraint):
         return Linearization(
             [
                 *names,
-                *(f"joint '{name}' at the begin of the run-up" for name in roomy),
+                *(f"joint '{name}' at the beginning of the run-up" for name in roomy),
                 *(f"velocity limit of {attainable.names[k]}" for k in limited),
             ],
             np.concatenate([
