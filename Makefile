@@ -175,8 +175,9 @@ viewer:
 	cd build/viewer && node_modules/.bin/esbuild viewer.js --bundle --minify --target=es2022 --legal-comments=none --outfile=bundle.js --log-level=warning
 	@{ echo '/*! three.js'; cat build/viewer/node_modules/three/LICENSE; echo '*/'; cat build/viewer/bundle.js; } > $(VIEWER_OUT)
 
-pictures: $(VENV)/.installed
+pictures: $(VENV)/.installed-test
 	$(BIN)/python docs/pictures.py
+	$(BIN)/python docs/strike_picture.py
 
 clean:
 	rm -rf $(VENV) demo docs/_build build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
