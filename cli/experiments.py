@@ -35,6 +35,7 @@ def rows_table(page: Page, rows: tuple[ControllerRow, ...] | list[ControllerRow]
     from impact_posture.config.json_block import jsonable
     from impact_posture.experiment.reproduction_summary import interval_text, percent
     from impact_posture.experiment.seed_statistics import headline
+    from impact_posture.simulation.series import RECOVERY
 
     lines = []
     for row in rows:
@@ -46,10 +47,13 @@ def rows_table(page: Page, rows: tuple[ControllerRow, ...] | list[ControllerRow]
         whole = row.completed == row.runs
         status = row.status if whole else f"{row.status} {row.runs - row.completed}/{row.runs}"
         lines.append((f"  {row.controller}{'' if row.rested else ' *'}", *numbers, status))
-    head = ("  controller", "q_total", "less %", "in 1 s %", "peak jump", "status")
+    head = ("  controller", "q_total", "less %", f"in {RECOVERY:g} s %", "peak jump", "status")
     page.table(head, lines, right=(1, 2, 3, 4))
     page.line("  q_total: motion in the impact windows (rad, m); peak jump in rad/s and m/s", style="dim")
-    page.line("  less %: reduction of q_total; in 1 s %: from each impact until 1 s later", style="dim")
+    page.line(
+        f"  less %: reduction of q_total; in {RECOVERY:g} s %: from each impact until {RECOVERY:g} s later",
+        style="dim",
+    )
     _loads_table(page, rows)
     nominal, *others = jsonable(rows)
     if nominal["controller"] == "nominal":

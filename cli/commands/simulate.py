@@ -182,6 +182,8 @@ def _show(page: Page, document: dict[str, Any], label: str, folder: Path, notes:
 
 
 def _numbers(metrics: dict[str, Any], prediction: dict[str, Any]) -> list[tuple[str, str]]:
+    from impact_posture.simulation.metrics import UNTIL_RECOVERY
+
     saturation = metrics["saturation_s"]
     joints = f"base {number(metrics['q_total_impact_base'])}, joints {number(metrics['q_total_impact_joints'])}"
     rows = [("q_total_impact", f"{number(metrics['q_total_impact'])}  ({joints}; rad, mixed with m)")]
@@ -189,7 +191,7 @@ def _numbers(metrics: dict[str, Any], prediction: dict[str, Any]) -> list[tuple[
         rows.append(("q_total_dwell", number(metrics["q_total_dwell"])))
     return [
         *rows,
-        ("q_total_recovery", f"{number(metrics['q_total_recovery'])}, until 1 s after each impact began"),
+        ("q_total_recovery", f"{number(metrics['q_total_recovery'])}, {UNTIL_RECOVERY}"),
         (
             "peak jump",
             f"{number(metrics['peak_jump'])} in the mean, {number(metrics['peak_jump_max'])} at most (rad/s, m/s)",

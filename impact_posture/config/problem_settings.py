@@ -73,6 +73,9 @@ STARTS, SCREENED = 16, 6144
 JOBS = 2
 # Number of bounds if --tradeoff is given without a number.
 TRADEOFF_POINTS = 16
+# Largest number of simultaneous contacts.  The impulses of six contacts have 63 corners.  Each additional contact
+# doubles the number of inequalities in the program.
+MOST_CONTACTS = 6
 # Default approach speed (m/s), and default coefficient of restitution, of predicted impacts.
 SPEED, RESTITUTION = Unstated(1.0), 0.0
 
@@ -150,8 +153,9 @@ class ImpactSettings(RobotSettings):
         "frame", "frame: the contact frame plus --offset; front: the foremost point towards the surface.", CONTACT
     )
     contact: Contacts | None = setting(
-        None, "Contact that replaces --frame and --normal; repeatable for up to 6 simultaneous contacts.", CONTACT,
-        "FRAME:NX,NY,NZ[:IMPULSE]", repeatable=True,
+        None,
+        f"Contact that replaces --frame and --normal; repeatable for up to {MOST_CONTACTS} simultaneous contacts.",
+        CONTACT, "FRAME:NX,NY,NZ[:IMPULSE]", repeatable=True,
     )  # fmt: skip
     bilateral: bool = setting(False, "Contacts can also pull, as in a grasp.", CONTACT)
     impulse: Positive = setting(1.0, "Bound on the impulse, N·s.", CONTACT)

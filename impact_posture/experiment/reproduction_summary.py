@@ -9,6 +9,7 @@ import numpy as np
 from impact_posture.experiment.reproduction import FITTED, PAPER, Reproduction, missed_targets
 from impact_posture.experiment.seed_statistics import ControllerRow, Interval, statistic
 from impact_posture.simulation.controllers.controller_factory import MEANING
+from impact_posture.simulation.metrics import UNTIL_RECOVERY
 from impact_posture.system.escape import markdown
 
 # Maximum number of decimals, so that numbers near zero stay short.
@@ -19,7 +20,7 @@ _COLUMNS = {
     "peak_force": 3,
 }  # fmt: skip
 LEGEND = (
-    "Recovery is the same integral and peak until 1 s after each impact began. In a relaxed tick, limits made a task "
+    f"Recovery is the same integral and peak {UNTIL_RECOVERY}. In a relaxed tick, limits made a task "
     "give way. The status is `completed`, or how many runs completed. There is no reduction if a run did not "
     "complete."
 )

@@ -12,16 +12,16 @@ from impact_posture.experiment.seed_statistics import Interval, headline, statis
 from impact_posture.output.plot.result_view import number
 from impact_posture.output.plot.run_view import RunView, run_header
 from impact_posture.output.report.report_page import Content, Table
-from impact_posture.simulation.metrics import AFTER_TOUCH
+from impact_posture.simulation.metrics import AFTER_TOUCH, UNTIL_RECOVERY
 from impact_posture.system.folder_record import typed_command
 
 # Metrics in the table of a report: key, unit and meaning.
 _METRICS = (
     ("q_total_impact", "m, rad", "way of the robot in the impact windows, ∫‖ν‖dt"),
-    ("q_total_recovery", "m, rad", "the same until 1 s after each impact began"),
+    ("q_total_recovery", "m, rad", f"the same {UNTIL_RECOVERY}"),
     ("peak_jump", "m/s, rad/s", f"largest ‖ν − ν⁻‖ within {AFTER_TOUCH}, mean of the contacts"),
     ("peak_jump_max", "m/s, rad/s", "the largest of the contacts"),
-    ("peak_recovery", "m/s, rad/s", "as peak_jump, until 1 s after each impact began"),
+    ("peak_recovery", "m/s, rad/s", f"as peak_jump, {UNTIL_RECOVERY}"),
     ("peak_force", "N", "largest normal force in the impact windows"),
     ("slip", "m", "way that the contact slid in the impact windows"),
 )
@@ -37,14 +37,16 @@ _LOADS = (
 _PUSH_MEANINGS = {
     "peak_jump": "largest ‖ν‖ from a push on until its window ends, mean of the pushes",
     "peak_jump_max": "the largest of the pushes",
-    "peak_recovery": "as peak_jump, until 1 s after each push began",
+    "peak_recovery": f"as peak_jump, {UNTIL_RECOVERY.replace('impact', 'push')}",
     "peak_force": "the push",
     "slip": "way that the fastest foot slid in the impact windows",
 }
+# Time between two ticks that a report shows, within impact windows and outside them, s.
+FINE, COARSE = 0.001, 0.025
 _MOVES = (
-    "The slider goes through time: every millisecond within the impact windows, every 25 ms elsewhere. Within a "
-    "window, the orange arrows show the change of velocity since it began. H, V, S and the ellipsoid are values of "
-    "the rigid model at the state of the robot."
+    f"The slider goes through time: every {1e3 * FINE:g} ms within the impact windows, every {1e3 * COARSE:g} ms "
+    "elsewhere. Within a window, the orange arrows show the change of velocity since it began. H, V, S and the "
+    "ellipsoid are values of the rigid model at the state of the robot."
 )
 
 

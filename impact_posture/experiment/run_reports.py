@@ -17,7 +17,7 @@ from impact_posture.experiment.job_store import JobStore
 from impact_posture.experiment.jobs import SCHEMA as SIMULATION_SCHEMA
 from impact_posture.experiment.jobs import Document, Job, controller_factory
 from impact_posture.experiment.reproduction import COMPARISON_SCHEMA
-from impact_posture.experiment.run_report_content import comparison_content, run_content
+from impact_posture.experiment.run_report_content import COARSE, FINE, comparison_content, run_content
 from impact_posture.impact.impact_contact import point_on
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.output.plot.run_view import RunView
@@ -31,8 +31,6 @@ from impact_posture.system.output_folder import write_json
 from impact_posture.system.text_files import read_text
 
 SIMULATION, COMPARISON, RUNS = "run.json", "comparison.json", "runs"
-# Time between two ticks that a report shows, within impact windows and outside them, s.
-_FINE, _COARSE = 0.001, 0.025
 # If a position exceeds this value, the state has diverged, m or rad.
 _AWAY = 1e3
 # Columns of :class:`Series` that figures use.
@@ -143,9 +141,9 @@ def thin(series: Series, windows: Iterable[Window]) -> Series:
     inside = np.zeros(len(t), dtype=bool)
     for window in windows:
         if window.kind == "impact":
-            inside |= (t >= window.begin - _FINE) & (t <= window.end)
+            inside |= (t >= window.begin - FINE) & (t <= window.end)
     # Count ticks instead of comparing times, because sums of time steps have rounding errors.
-    stride = np.where(inside, max(round(_FINE / step), 1), max(round(_COARSE / step), 1))
+    stride = np.where(inside, max(round(FINE / step), 1), max(round(COARSE / step), 1))
     kept = np.flatnonzero((np.arange(len(t)) % stride == 0) | (np.arange(len(t)) == len(t) - 1))
     size = np.linalg.norm(series.force[: len(t)], axis=1)
     begins = np.concatenate([[0], kept[:-1] + 1])

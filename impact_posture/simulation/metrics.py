@@ -8,13 +8,15 @@ import numpy as np
 
 from impact_posture.impact.evaluation.impact_effect import ImpactLoad, WorstJoint, impact_effect, mean_load
 from impact_posture.simulation.run import Run
-from impact_posture.simulation.series import Array, Flags, Series, Window
+from impact_posture.simulation.series import RECOVERY, Array, Flags, Series, Window
 from impact_posture.simulation.setup import Setup
 
 # The velocity jump is measured within this time after the first touch, s.
 JUMP = 0.015
 # The same time in words.
 AFTER_TOUCH = f"{1e3 * JUMP:g} ms of the touch"
+# The recovery window in words.
+UNTIL_RECOVERY = f"until {RECOVERY:g} s after each impact began"
 # A command is saturated if its distance from a limit is below this share of the range.
 _NEAR = 1e-3
 

@@ -17,6 +17,7 @@ from itertools import product
 import casadi as ca
 import numpy as np
 
+from impact_posture.config.problem_settings import MOST_CONTACTS
 from impact_posture.dynamics.tree import Tree, Wrench
 from impact_posture.errors import ContactError, MetricError
 from impact_posture.impact.impact_contact import ImpactContact
@@ -36,9 +37,6 @@ from impact_posture.impact.quantities.lifted_form import (
 )
 from impact_posture.impact.worst_case.model_set import finite_maximum, first_of_largest
 from impact_posture.system.arrays import Array
-
-# Six contacts have 63 corners.  Each additional contact doubles the number of inequalities in the program.
-MOST_CONTACTS = 6
 
 
 @dataclass(frozen=True, eq=False)
