@@ -157,7 +157,8 @@ def _notes(runs: list[dict[str, Any]]) -> Iterator[str]:
 
 
 # Scenarios, and delays (s) of contacts that are early or late; after REST (s), the contact point is at rest.
-INSTANTS, LATE, REST = ("panda-tap", "ur5-strike", "aerial-vertical"), (-0.05, -0.02, 0.0, 0.02, 0.05), 0.25
+INSTANTS = ("panda-tap", "ur5-strike", "aerial-vertical", "g1-strike 0.5", "talos-strike 0.5")
+LATE, REST = (-0.05, -0.02, 0.0, 0.02, 0.05), 0.25
 INSTANTS_HEAD = (
     "scenario", "contact, ms late", "its speed, m/s", "planned speed then, m/s", "measured / predicted jump",
     "at a limit in the run-up, ms", "after the contact, ms", f"speed {REST:g} s later, m/s", "outcome",
@@ -207,7 +208,7 @@ def _early_and_late(case: str) -> Iterator[list[str]]:
         k = int(np.searchsorted(series.t, window.begin + REST))
         events = judge(shifted, record)
         yield [
-            f"`{case}`", f"{1e3 * (window.begin - begin):+.0f}" if made else "–",
+            f"`{case.split()[0]}`", f"{round(1e3 * (window.begin - begin)):+d}" if made else "–",
             f"{made[0].approach:.2f}" if made else "–", f"{speed(*path.at(then)[:2]):.2f}",
             f"{made[0].ratio:.2f}" if made else "–", *limits, f"{abs(speed(series.q[k], series.v[k])):.3f}",
             "; ".join(event.what for event in events) or "completed",
