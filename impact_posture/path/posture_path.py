@@ -25,6 +25,7 @@ from impact_posture.system.arrays import Array
 
 # Why a path that was reached is not returned.
 _NOT_SMOOTH = "no smooth curve through the path satisfies the constraints"
+_EVERYWHERE = "velocity limits and position limits of the joints in every posture of the search"
 # Largest number of optima to try, best first.
 _OPTIMA = 5
 # An optimum with a larger objective is struck instead if its speed exceeds the greatest speed so far by this factor.
@@ -191,7 +192,7 @@ def _struck(
     best: tuple[int, RunUp, str] | None = None
     failure = ""
     for k, target in _targets(solution, space):
-        run = run_up(solution.problem, target, speed, limits)
+        run = run_up(solution.problem, target, required, limits)
         if not isinstance(run, str) and best and run.strike.speed < _FASTER * best[1].strike.speed:
             continue
         led = run if isinstance(run, str) else _led(solution.initial, run, limits, seed, effort)
@@ -199,7 +200,7 @@ def _struck(
             failure = failure or led
             continue
         best, struck = (k, *led), led[0].strike
-        if not struck.hindrance or struck.speed >= required:
+        if not struck.hindrance:
             break
         slow = f"the optimum can be struck at {struck.speed:.3g} m/s at most, because of {struck.hindrance}"
         failure = failure or slow
@@ -208,7 +209,8 @@ def _struck(
     k, run, method = best
     after = follow_through(solution.problem, run.motion.rows.q[-1], run.strike.velocity, restitution, limits)
     failure = f"{failure}; the path ends at optimum number {k + 1} of {len(solution.optima)}" if k else ""
-    strike = replace(run.strike, follow_through=after)
+    hindrance = run.strike.hindrance or (_EVERYWHERE if required < speed else "")
+    strike = replace(run.strike, stated_speed=speed, hindrance=hindrance, follow_through=after)
     return _finished(run.spaces.approach, run.motion, method, limits, failure, strike=strike)
 
 

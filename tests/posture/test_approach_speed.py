@@ -185,7 +185,7 @@ def test_a_strike_beyond_the_joints_gets_the_greatest_speed() -> None:
     attainable = AttainableSpeed(posed.problem.robot, posed.problem.objective, posed.problem.requirements)
     reached = attainable.reached(solution.q)
     assert reached is not None and required.speed * (1 - 1e-6) <= reached <= 1.01 * required.speed
-    assert any("20 m/s cannot be reached; the greatest speed is " in note for note in solution.notes)
+    assert any("20 m/s cannot be reached, so the program requires the greatest" in note for note in solution.notes)
     drawn = (feasible_start(posed.problem, index, 1) for index in range(40))
     speeds = [attainable.reached(q) for q in drawn if q is not None]
     assert len(speeds) > 10 and max(speeds) <= required.speed * 1.002

@@ -67,7 +67,7 @@ def result_document(
     answer = list(postures)[-1]
     struck = path is not None and "strike" in path
     fastest = path["strike"]["speed"] if struck else attainable[answer]  # type: ignore[index]
-    known = Circumstances(fastest, solution.moved, no_path)
+    known = Circumstances(fastest, solution.moved, no_path, struck)
     fault = [solution.compiler_fault] if solution.compiler_fault else []
     at_posture = posture_warnings(prepared, solution.initial, postures[answer], holding[answer], answer)
     told = (warning for evaluation in evaluations.values() for warning in evaluation.warnings)
@@ -77,7 +77,7 @@ def result_document(
         "schema": SCHEMA,
         "verdict": verdict(impact, evaluations["initial"], evaluations[answer], known).to_dict(),
         **impact.to_dict(solution.initial),
-        "constraints": prepared.problem.describe(),
+        "constraints": solution.problem.describe(),
         **blocks,
         "initial": {"given_q": prepared.problem.given.tolist(), "moved": solution.moved, **blocks["initial"]},
         "reduction": solution.reduction,

@@ -18,6 +18,8 @@ _REACHED = 5e-3
 # surface in the compression time, m.  Up to this travel, jumps in `make study-verdict` are within 5 % of the
 # simulation or 1 % of the approach speed.
 LONG_TRAVEL = 0.015
+# Hint if the joints are too slow and no path strikes.
+_SLOW = "add `approach`, or correct the `speed`"
 # A distance (rad, m) up to this value is a rounding error.
 _STILL = 1e-6
 
@@ -48,11 +50,13 @@ class Circumstances:
             m/s; ``None`` if unknown or unbounded.
         moved: Distance from the given to the initial posture, rad mixed with m.
         no_path: Why no path leads to the optimum, and where the path ends; empty if it ends at the optimum.
+        strikes: Whether ``attainable`` is the speed of a path that strikes.
     """
 
     attainable: float | None = None
     moved: float = 0.0
     no_path: str = ""
+    strikes: bool = False
 
 
 def conditions(
@@ -74,7 +78,7 @@ def _arrival(impact: ResolvedImpact, known: Circumstances) -> Iterator[Condition
         yield Condition(
             "arrival",
             f"cannot arrive at {impact.speed:g} m/s ({known.attainable:.2g} m/s at most)",
-            "add `approach`, or correct the `speed`",
+            "lower the `speed`, or free the pose (`contact_pose`)" if known.strikes else _SLOW,
             refutes=True,
         )
 

@@ -71,7 +71,7 @@ def _slowed(least: LeastViolation) -> LeastViolation:
         return least
     slower = approach.slower((1 - _SLOWER) * greatest)
     constraints = tuple(slower if c is approach else c for c in least.problem.constraints)
-    note = f"{approach.speed:g} m/s cannot be reached; the greatest speed is {greatest:.3g} m/s"
+    note = f"{approach.speed:g} m/s cannot be reached, so the program requires the greatest speed, {greatest:.3g} m/s"
     notes = (*least.problem.notes, note)
     return replace(least, problem=replace(least.problem, constraints=constraints, notes=notes), conflicts={})
 
