@@ -21,6 +21,9 @@ from impact_posture.posture.approach.approach_speed import ApproachSpeed
 from impact_posture.posture.approach.attainable_speed import _RESERVED, _ROOM, AttainableSpeed
 from impact_posture.posture.formulation.problem_file import Prepared, prepare
 from impact_posture.posture.manifold.feasible_start import feasible_start
+from impact_posture.posture.program.program_rows import ProgramRows
+from impact_posture.posture.search.growing_search import feasible
+from impact_posture.posture.search.initial_posture import _at_speed, initial_posture
 from impact_posture.posture.search.multistart import solve
 from tests.support.command import refused, run
 from tests.support.constraints import check_lifted_rows
@@ -189,6 +192,20 @@ def test_a_strike_beyond_the_joints_gets_the_greatest_speed() -> None:
     drawn = (feasible_start(posed.problem, index, 1) for index in range(40))
     speeds = [attainable.reached(q) for q in drawn if q is not None]
     assert len(speeds) > 10 and max(speeds) <= required.speed * 1.002
+
+
+def test_a_clearance_that_conflicts_with_the_speed_of_a_strike_slows_it() -> None:
+    """At 1 m/s, a link of panda would touch the wall.  No random posture without collisions is much faster."""
+    posed = prepared("panda", 1.0, strike=True, normal=(-1, 0, 0), hold=None, collision=True)
+    problem, q = initial_posture(posed.problem, 0, ProgramRows(posed.problem))
+    (required,) = (c for c in problem.constraints if isinstance(c, ApproachSpeed))
+    assert feasible(problem, q) and required.speed < 1
+    attainable = AttainableSpeed(posed.problem.robot, posed.problem.objective, posed.problem.requirements)
+    drawn = [q for index in range(30) if (q := feasible_start(problem, index, 1)) is not None]
+    clear = _at_speed(problem, 1e-3)
+    speeds = [(attainable.reached(q) or 0.0, feasible(clear, q)) for q in drawn]
+    assert max(speed for speed, _ in speeds) > 1
+    assert 0.7 < max(speed for speed, apart in speeds if apart) < 1.02 * required.speed
 
 
 @pytest.mark.parametrize(

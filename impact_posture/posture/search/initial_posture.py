@@ -21,6 +21,8 @@ _QUICK = 1e-9
 # If no posture allows the speed of a strike, the required speed is below the greatest speed by this share, so that
 # the program has an interior.  A greatest speed below the second share of the stated speed is a conflict.
 _SLOWER, _LEAST_SPEED = 1e-3, 0.01
+# Number of speeds that the search for the greatest speed tries if other constraints conflict with the speed.
+_BISECTIONS = 8
 
 
 def initial_posture(problem: ConstrainedProblem, seed: int, rows: ProgramRows) -> tuple[ConstrainedProblem, Array]:
@@ -39,8 +41,9 @@ def initial_posture(problem: ConstrainedProblem, seed: int, rows: ProgramRows) -
     if start is not None and feasible(problem, start):
         return problem, start
     given, problem = problem.given, problem if start is None else replace(problem, given=start)
-    least = find_conflicts(problem, seed, ElasticProgram(problem, rows))
-    least = _slowed(least) if problem.requirements.strike else least
+    program = ElasticProgram(problem, rows)
+    least = find_conflicts(problem, seed, program)
+    least = _slowed(least, seed, program) if problem.requirements.strike else least
     if least.conflicts:
         limits = f"; there {', '.join(least.at_limits[:4])}" if least.at_limits else ""
         sign = "; check the sign of the normal, which points towards the robot, and how far the `surface` reaches"
@@ -61,19 +64,37 @@ def initial_posture(problem: ConstrainedProblem, seed: int, rows: ProgramRows) -
     return replace(least.problem, given=given), projection.q
 
 
-def _slowed(least: LeastViolation) -> LeastViolation:
-    """Return the problem with the greatest approach speed of the search if only the approach speed conflicts."""
+def _slowed(least: LeastViolation, seed: int, program: ElasticProgram) -> LeastViolation:
+    """Return a posture without conflicts at the greatest approach speed, or ``least`` if the speed is not the reason.
+
+    If other constraints conflict with the speed, as clearances do, their prices hide the greatest speed, so it is
+    searched by bisection.
+    """
     (approach,) = [c for c in least.problem.constraints if isinstance(c, ApproachSpeed)] or (None,)
-    if approach is None or least.conflicts.keys() != {approach.name}:
+    if approach is None or not least.conflicts:
         return least
-    greatest = approach.speed - least.conflicts[approach.name]
-    if greatest <= _LEAST_SPEED * approach.speed:
+    low, high, best = 0.0, approach.speed, least
+    if least.conflicts.keys() == {approach.name}:
+        low = high = approach.speed - least.conflicts[approach.name]
+    speed, problem = _LEAST_SPEED * approach.speed, least.problem
+    for _ in range(_BISECTIONS if low < high else 0):
+        tried = find_conflicts(_at_speed(problem, speed), seed, program, (least.q,), beside=_QUICK)
+        problem = tried.problem
+        if tried.conflicts and not low:
+            return least
+        low, high, best = (low, speed, best) if tried.conflicts else (speed, high, tried)
+        speed = (low + high) / 2
+    if low < _LEAST_SPEED * approach.speed:
         return least
-    slower = approach.slower((1 - _SLOWER) * greatest)
-    constraints = tuple(slower if c is approach else c for c in least.problem.constraints)
-    note = f"{approach.speed:g} m/s cannot be reached, so the program requires the greatest speed, {greatest:.3g} m/s"
-    notes = (*least.problem.notes, note)
-    return replace(least, problem=replace(least.problem, constraints=constraints, notes=notes), conflicts={})
+    note = f"{approach.speed:g} m/s cannot be reached, so the program requires the greatest speed, {low:.3g} m/s"
+    problem = _at_speed(replace(problem, notes=(*problem.notes, note)), (1 - _SLOWER) * low)
+    return replace(best, problem=problem, conflicts={})
+
+
+def _at_speed(problem: ConstrainedProblem, speed: float) -> ConstrainedProblem:
+    """Return the problem with another approach speed, m/s."""
+    constraints = (c.slower(speed) if isinstance(c, ApproachSpeed) else c for c in problem.constraints)
+    return replace(problem, constraints=tuple(constraints))
 
 
 def _turn_hint(problem: ConstrainedProblem, seed: int) -> str:
