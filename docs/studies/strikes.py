@@ -34,8 +34,7 @@ from impact_posture.system.arrays import Array
 
 # A number after a name replaces the approach speed of the scenario, m/s.
 CASES = (
-    "ur5-strike", "panda-tap", "aerial-vertical", "aerial-lateral", "g1-strike 0.5", "g1-strike", "talos-strike 0.5",
-    "talos-strike"
+    "ur5-strike", "panda-tap", "aerial-vertical", "aerial-lateral", "g1-strike 0.5", "g1-strike", "talos-strike 0.5"
 )  # fmt: skip
 CONTROLLERS = ("strike", "nominal", "robust-flow")
 SPREAD = Spread(speed=0.1, normal=5.0, gap=0.005)

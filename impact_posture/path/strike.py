@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 
 import daqp
 import numpy as np
@@ -27,8 +28,8 @@ from impact_posture.system.arrays import Array, null_space
 _UNIQUE = 1e-4
 # Weight of the share of the room that exceeds 1, relative to the largest share of a velocity limit.
 _CROWDED = 100.0
-# If possible, the robot comes from the inside of an active bound with this share of the contact speed (rad/s or m/s).
-# Otherwise, the curve of the run-up would bend across the bound at once.
+# If the curve of a run-up bends across an active bound at once, the robot comes from the inside of this bound, with
+# this share of the contact speed (rad/s or m/s).
 _RATE = 0.02
 # An inequality or joint limit is active within this distance (m, rad, or the unit of the constraint).
 _ACTIVE = 1e-3
@@ -115,15 +116,15 @@ def _tipping(problem: ConstrainedProblem, model: Numeric) -> Array:
 
 
 def impact_velocity(
-    spaces: StrikeSpaces, q: Array, speed: float, time: float, *, balanced: bool = True
+    spaces: StrikeSpaces, q: Array, speed: float, time: float, *, balanced: bool = True, inside: bool = False
 ) -> tuple[Array, float] | None:
     """Return ``ν`` with ``Jν = −v n`` on the constraints of the run-up, and its largest share of a velocity limit.
 
     The velocity minimizes the largest of ``|ν_i|/ν̄_i`` and, if ``balanced``, of the shares of :func:`_tipping`, plus
     a small weight times ``Σ (ν_i/ν̄_i)²`` that makes it unique.  Entries without a limit count only in the sum, in
     rad/s or m/s.  If possible, ``q − νt`` is within inequalities and joint limits to first order, where ``t`` is the
-    ``time``, s, and active bounds are not active before.  If not, the smallest share of ``ν`` does not fit.  Return
-    ``None`` if no velocity exists.
+    ``time``, s.  If not, the smallest share of ``ν`` does not fit.  If ``inside``, the robot comes from the inside of
+    active bounds with :data:`_RATE`.  Return ``None`` if no velocity exists.
     """
     robot = spaces.run_up.problem.robot
     limited = np.isfinite(robot.velocity_limits)
@@ -139,24 +140,21 @@ def impact_velocity(
     single = np.eye(len(scale))[limited]
     tipping = _tipping(spaces.run_up.problem, Numeric(robot.model).at(q)) * scale
     shares = np.vstack([single, -single, *([tipping] if balanced else [])])
-    toward, distance, inside = _room(spaces.run_up, q)
+    toward, distance, movable = _room(spaces.run_up, q)
     rows = np.vstack([shares, -toward * scale, np.zeros(len(scale))])
     of_share = np.repeat([1.0, 0.0], [len(shares), len(rows) - len(shares)])
     of_room = np.concatenate([np.zeros(len(shares)), distance / time, [1.0]])
-    leave = np.concatenate([np.zeros(len(shares)), np.where(distance < _ACTIVE, inside, 0.0), [0.0]])
-    for rate in (_RATE * speed, 0.0):
-        upper = -rows @ least - np.append(np.zeros(len(rows) - 1), 1.0) - rate * leave
-        x, _, flag, _ = daqp.solve(
-            _UNIQUE * np.eye(N.shape[1] + 2),
-            np.append(np.zeros(N.shape[1]), [1.0, _CROWDED]),
-            np.column_stack([rows @ N, -of_share, -of_room]),
-            upper,
-            np.full_like(upper, -1e30),
-            np.zeros(len(upper), dtype=np.int32),
-        )
-        if flag == 1:
-            break
-    else:
+    rate = _RATE * speed * np.where(inside & (distance < _ACTIVE), movable, 0.0)
+    upper = -rows @ least - np.concatenate([np.zeros(len(shares)), rate, [1.0]])
+    x, _, flag, _ = daqp.solve(
+        _UNIQUE * np.eye(N.shape[1] + 2),
+        np.append(np.zeros(N.shape[1]), [1.0, _CROWDED]),
+        np.column_stack([rows @ N, -of_share, -of_room]),
+        upper,
+        np.full_like(upper, -1e30),
+        np.zeros(len(upper), dtype=np.int32),
+    )
+    if flag != 1:
         return None
     relative = least + N @ x[:-2]
     return relative * scale, float(np.abs(relative[limited]).max(initial=0.0))
@@ -181,14 +179,15 @@ def run_up(problem: ConstrainedProblem, q: Array, speed: float, limits: Actuator
     """Return the shortest run-up to the stated speed at ``q``, or to the greatest speed; or why none exists.
 
     The contact frame turns only if there are too few joints to prevent it.  The capture point of a robot that stands
-    stays away from the edges of the feet, unless this bounds the speed.
+    stays away from the edges of the feet, unless this bounds the speed.  If active bounds limit the speed, the robot
+    comes from the inside of these bounds.
     """
     spaces, time = StrikeSpaces(problem, q), SHORTEST[limits.rotors] / 2
     fastest: RunUp | str = "the joints cannot move the contact along the normal"
     if impact_velocity(spaces, q, speed, time) is None:
         spaces = StrikeSpaces(problem, q, turns=True)
-    for balanced in (True, False) if problem.requirements.com_over_feet else (False,):
-        impact = impact_velocity(spaces, q, speed, time, balanced=balanced)
+    for balanced, inside in product((True, False) if problem.requirements.com_over_feet else (False,), (False, True)):
+        impact = impact_velocity(spaces, q, speed, time, balanced=balanced, inside=inside)
         run = fastest if impact is None else _timed_run_up(spaces, q, *impact, speed, limits)
         if isinstance(run, RunUp) and not run.strike.hindrance:
             return run

@@ -144,7 +144,7 @@ def test_velocities_that_leave_an_active_bound_are_preferred() -> None:
     # The run-up comes from q − t ν, which this limit forbids.
     (lower if sign > 0 else upper)[worst] = at[worst]
     blocked = replace(solution.problem, lower=lower, upper=upper)
-    velocity = impact_velocity(StrikeSpaces(blocked, at), at, SPEED, 0.05)
+    velocity = impact_velocity(StrikeSpaces(blocked, at), at, SPEED, 0.05, inside=True)
     assert velocity is not None and sign * velocity[0][worst] <= -_RATE * SPEED * (1 - 1e-6)
 
 
