@@ -188,7 +188,8 @@ def _struck(
 ) -> PosturePath | str:
     """Return the path that strikes the first optimum with the stated or else the greatest speed; or why none does."""
     # The program requires the greatest possible speed if no posture allows the stated speed.
-    required = min([speed, *(c.speed for c in solution.problem.constraints if isinstance(c, ApproachSpeed))])
+    constraints = solution.problem.constraints if solution.problem.requirements.strike else ()
+    required = min([speed, *(c.speed for c in constraints if isinstance(c, ApproachSpeed))])
     best: tuple[int, RunUp, str] | None = None
     failure = ""
     for k, target in _targets(solution, space):
