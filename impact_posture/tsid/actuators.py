@@ -14,9 +14,9 @@ class Actuators:
     """Actuation matrix ``G = blkdiag(G_b, I)``, with pseudo-inverse, null space and control limits.
 
     ``G_b`` (6 × rotors) maps rotor thrusts to the wrench on the base, in base axes.  A generalized force
-    ``p = [p_b; p_joints]`` can be produced only if ``blindᵀ p_b = 0`` (6 equations for a legged robot, none for six
-    independent rotors).  The controls are then ``u = [G_b⁺ p_b + spare w; p_joints]``.  With redundant rotors, ``w``
-    selects one of the possible thrust vectors.
+    ``p = [p_b; p_joints]`` can be produced only if ``blindᵀ p_b = 0``.  These are 6 equations for a legged robot and
+    none for six independent rotors.  The controls are then ``u = [G_b⁺ p_b + spare w; p_joints]``.  With redundant
+    rotors, ``w`` selects one of the possible thrust vectors.
 
     Attributes:
         rotors: Number of rotors.
@@ -31,7 +31,7 @@ class Actuators:
         names: Names of the controls.
 
     Raises:
-        InputError: A joint follows another joint (:class:`JointCoupling`), and robot.toml does not hold both.
+        InputError: A joint follows another joint (:class:`JointCoupling`), and robot.toml does not lock both joints.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -72,7 +72,7 @@ class Actuators:
         return np.concatenate([self.inverse @ force[: self.base] + self.spare @ spare, force[self.base :]])
 
     def rotor_speeds(self, thrusts: Array) -> Array:
-        """Return ``√(thrust/c_f)`` in the unit of ``speed_max``, zero for a negative thrust; shape (rotors,)."""
+        """Return the rotor speeds ``√(thrust/c_f)`` in the unit of ``speed_max``; a negative thrust gives zero."""
         if self._propulsion is None:
             return np.zeros(0)
         return np.asarray(np.sqrt(np.maximum(thrusts, 0.0) / self._propulsion.thrust_coefficient))

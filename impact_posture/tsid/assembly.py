@@ -19,7 +19,7 @@ from impact_posture.tsid.tasks.task import TaskStack
 _IDLE = 1e-8
 # Weight of a squared moment, (N·m)², relative to a squared force, N².
 _MOMENT = 100.0
-# The tasks leave a direction free if its singular value is below this share of the largest singular value.
+# The tasks leave a direction of motion free if its singular value is below this share of the largest one.
 _REDUNDANT = 1e-6
 
 
@@ -108,7 +108,7 @@ class Assembly:
         self.rank.reset()
 
     def build_qp(self, state: State) -> QP:
-        """Fill the buffers at ``state`` and return the QP.  Each call returns the same object."""
+        """Compute the QP at ``state`` in the existing buffers.  Each call returns the same object."""
         self.strict.update(state)
         self.weighted.update(state)
         self.contacts.update(state)
@@ -150,7 +150,7 @@ class Assembly:
     def redundancy(self, state: State) -> Array:
         """Return an orthonormal basis of the accelerations that only the posture task determines, shape (nv, r).
 
-        If the weighted tasks leave no such accelerations, ignore the weighted tasks.
+        If the weighted tasks leave no acceleration free, the method ignores the weighted tasks.
         """
         rows = [self.contacts.J, self.strict.J, self.weighted.J]
         Z = null_space(np.vstack(rows), _REDUNDANT)

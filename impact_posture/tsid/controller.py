@@ -25,11 +25,11 @@ from impact_posture.tsid.task_formulation import TaskFormulation
 from impact_posture.tsid.tasks.impact_robust import ImpactRobustPosture
 from impact_posture.tsid.tasks.task import Task
 
-# Largest time step of ramps, in periods of the controller.  A tick after a long pause would otherwise end a ramp.
+# Largest time step of ramps, in periods of the controller.  Without it, a tick after a long pause would end a ramp.
 _LONGEST = 10
 # Least nv for which LAPACK factorizes the cost (:class:`WhitenedSolver`).  For smaller robots, this saves no time.
 _LARGE = 20
-# A measurement is invalid if the sum of its squares exceeds this value (numbers of about 1e8 m, rad/s or N).
+# A measured vector is invalid if the sum of its squared entries exceeds this value.  Its root is 1e8 m, rad/s or N.
 _ABSURD = 1e16
 # Largest violation of a control limit, relative to the largest limit.
 _EXCESS = 1e-6
@@ -60,7 +60,7 @@ class Command:
     """Command for the motors, in arrays that the controller does not change later.
 
     Attributes:
-        u: Rotor thrusts (N), then joint torques (N·m), shape (controls,).
+        u: Controls ``u``: rotor thrusts (N), then joint torques (N·m), shape (controls,).
         torque: Joint torques, N·m (N for prismatic joints), shape (joints,).
         rotor_speed: Rotor speeds in the unit of ``speed_max`` in robot.toml, shape (rotors,).
         status: Result of the tick.
@@ -83,8 +83,9 @@ class Report:
     Attributes:
         status: Result of the tick.
         relaxed: Strict levels and limits that more important constraints prevent, the most important first.
-        deficient: Strict levels that do not hold because their rows are dependent.  More important levels determine
-            the same motion, rows contradict each other, or the posture is nearly singular (:class:`LevelRank`).
+        deficient: Strict levels that do not hold because their rows are dependent (:class:`LevelRank`).  Either more
+            important levels determine the same motion, or rows contradict each other, or the posture is nearly
+            singular.
         residuals: Task name → ``ÿ − ÿ*``; the name ``contacts`` stands for all contacts.
         active: Pairs of the name of an active bound and ``lower`` or ``upper``.
         dynamics: Error of the equations of motion, ``‖Mν̇ + h − Gu − Jᵀf − J_eᵀF̂‖_∞``.
@@ -271,7 +272,7 @@ class Controller:
         return self._command(u, self._status, assembly.acceleration(solved.z), assembly.forces(solved.z))
 
     def _far_from_unit(self, q: Array) -> bool:
-        """Return whether a quaternion, or a cosine with its sine, is far from unit length."""
+        """Return whether a quaternion or a pair (cosine, sine) in ``q`` is far from unit length."""
         return any(abs(q[part].dot(q[part]) - 1.0) > 1e-2 for part in self.state.unit_parts)
 
     def _held(self, status: Status, v: Array) -> Command:

@@ -8,7 +8,7 @@ from impact_posture.robot.robot import Robot
 
 
 class JointRanges:
-    """Position and velocity limits along the entries of ν, infinite for the base and for continuous joints.
+    """Position and velocity limits along the entries of ν; infinite position limits for base and continuous joints.
 
     Attributes:
         lower: Lower position limits, rad or m, shape (nv,).

@@ -15,11 +15,12 @@ from impact_posture.tsid.qp.quadratic_program import EQUALITY, QP, Solved
 
 # A row counts as satisfied if its error is below this share of the sum of its absolute terms.
 _OFF = 1e-6
-# A row that violates a bound by more than this keeps its value; relative to the norm of the row times the norm of z.
+# A row that violates a bound by more than this keeps its value while the cost is minimized.  The violation is
+# relative to the norm of the row times the norm of z.
 _MISSES = 1e-9
 # Largest violation of a bound by a result, relative as for ``_MISSES``.
 _ROUNDING = 1e-13
-# Bound that DAQP treats as infinite, and the settings of DAQP for the scaled program in :func:`_cheapest`.
+# ``_FAR`` is a bound that DAQP treats as infinite.  ``_SETTINGS`` are the DAQP settings of :func:`_cheapest`.
 _FAR, _SETTINGS = 1e30, SETTINGS | {"primal_tol": 1e-11}
 # Curvatures of the cost below this share of the largest curvature are raised to this share.
 _FLATTEST = 1e-14
@@ -57,8 +58,8 @@ def solve(assembly: Assembly, solver: DaqpSolver) -> Outcome:
     """Solve the QP of the assembly, starting from the solver's active set.  If this fails, solve a relaxed QP.
 
     Dynamics, control limits and friction always hold, because every state has an acceleration that satisfies them.
-    The acceleration bounds of joint limits are exceeded only as far as these hard rows require.  Then follow the
-    strict levels, the most important first.  The error of a level is minimized by least squares, and the levels below
+    The acceleration bounds of joint limits are exceeded only as far as these hard rows require.  The strict levels
+    follow, the most important first.  The error of a level is minimized by least squares, and less important levels
     must not change this error.  Last, the cost determines the accelerations that are still free.
     """
     qp = assembly.rank.qp
@@ -87,7 +88,7 @@ def _cheapest(qp: QP, units: Array, nearest: Array) -> Solved:
 
     Equations, and rows that violate their bounds, keep their values.  The cost is therefore minimized in the null
     space of these rows: ``z = nearest + W y``.  In the basis ``W``, the cost is a sum of squares.  All other bounds
-    hold.  Return ``nearest`` without a free direction, or if the solver failed.
+    hold.  Return ``nearest`` if no direction is free or the solver failed.
     """
     values, rows = qp.values(nearest), np.vstack([np.eye(qp.n), qp.A]) * units
     size, lengths = max(1.0, float(np.max(np.abs(nearest / units)))), np.linalg.norm(rows, axis=1)
@@ -125,7 +126,7 @@ def _cheapest(qp: QP, units: Array, nearest: Array) -> Solved:
 
 
 def missed(assembly: Assembly, z: Array, *, equations: bool) -> tuple[Relaxed, ...]:
-    """Return the strict levels with errors at ``z`` in their equations; if not ``equations``, in their other rows."""
+    """Return the strict levels that ``z`` violates; ``equations`` selects their equations or their other rows."""
     levels = []
     for name, level in assembly.levels:
         rows = assembly.rank.rows(level, equations)

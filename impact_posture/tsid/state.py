@@ -38,7 +38,7 @@ class State:
     """
 
     def __init__(self, robot: Robot, points: Iterable[Point] = ()) -> None:
-        """Size the buffers for a robot and the points whose kinematics :meth:`at` returns.
+        """Size the buffers for a robot and for the points whose kinematics :meth:`at` returns.
 
         Raises:
             FrameNotFound: The robot lacks a frame; the exception contains the most similar names.

@@ -23,7 +23,7 @@ from impact_posture.tsid.state import State
 @checked
 @dataclass(frozen=True, eq=False)
 class SupportContact:
-    """A foot (or hand) on the ground.
+    """Contact of a foot or a hand with the ground.
 
     Attributes:
         point: Contact point.
@@ -35,8 +35,9 @@ class SupportContact:
         kp: Stiffness that pulls the contact back to its pose at the last ``reset``, 1/s².
         kd: Damping of the contact, 1/s.
         weight: Weight of the contact's acceleration in the cost; with ``None``, the contact is a hard constraint.
-            The rows of several points can be dependent, and their rank can change with the posture (the four feet of
-            solo8 have rank 9 to 11 of 12).  As hard constraints, such rows would require unbounded accelerations.
+            The rows of several points can be dependent, and their rank can change with the posture.  For example, the
+            12 rows of solo8's feet have rank 9 to 11.  As hard constraints, they would require unbounded
+            accelerations.
     """
 
     point: Point

@@ -78,7 +78,7 @@ class TaskFormulation:
         return tuple(dict.fromkeys(points if self.force_point is None else [*points, self.force_point]))
 
     def lead(self, state: State, a: Array) -> None:
-        """Move the targets of all tasks along a motion, at ``q`` and ``ν`` of ``state`` and ``ν̇`` = ``a``, (nv,).
+        """Move the targets of all tasks along a motion with ``q`` and ``ν`` of ``state`` and ``ν̇ = a``, shape (nv,).
 
         A target becomes the output of its task, with its velocity ``Jν`` and its acceleration ``Jν̇ + J̇ν``.
         """
@@ -108,7 +108,7 @@ def aerial_formulation(
         posture: Nominal posture task (:class:`JointPosture`), or an impact-robust posture task.
         end_effector: Task of the end effector; by default, a pose task with ``kp = 60``.  A measured force acts at
             the point of this task.
-        tilt: Task of the tilt; by default, with ``kp = 100``.
+        tilt: Task of the tilt; by default, a tilt task with ``kp = 100``.
         order: With ``strict``, tilt and end effector are equality constraints (Problems 2 and 3).  With ``weighted``,
             all tasks are in the cost, with their weights (Problem 1).
         law: Law of the joint limits.
@@ -164,8 +164,8 @@ def legged_formulation(
         posture: Nominal or impact-robust posture task.
         kp: Stiffness of center of mass and base orientation, 1/s².
         friction: Coulomb coefficient of the ground.
-        center_of_mass: Task of the center of mass; by default, with weight 10.
-        base: Task of the base orientation; by default, with weight 1.
+        center_of_mass: Task of the center of mass; by default, a task with weight 10.
+        base: Task of the base orientation; by default, a task with weight 1.
         contacts: Contacts with the ground; by default, the robot's supports.
         force_point: Point, not at a foot, where a measured contact force acts.  With ``None``, the dynamics ignore
             measured forces.
@@ -190,7 +190,7 @@ def _manipulator(
     order: Order,
     law: LimitLaw | None,
 ) -> TaskFormulation:
-    """Return the stack of the tasks ``above``, the end effector and the posture; one level for each strict task."""
+    """Return the stack of the tasks in ``above``, the end effector and the posture; each strict task is one level."""
     frame = robot.spec.contact.frame
     if end_effector is None:
         if frame is None:

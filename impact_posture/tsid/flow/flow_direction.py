@@ -20,20 +20,19 @@ from impact_posture.tsid.state import State
 
 # Least value of ``H/H₀`` in ``√(H/H₀)``.
 _LEAST = 1e-8
-# If the sine of the tilt is smaller than this, the slope of the tilt is set to zero, because the tilt axis is
-# undefined.
+# Below this sine of the tilt angle, the tilt axis is undefined, and the slope of the tilt is set to zero.
 _LEVEL = 1e-6
 # Largest violation of a limit during braking, rad (m) for joints, and a share of the range for static controls.
 _NEAR = 1e-3
-# If a limit is violated by less than this, the flow may move along the limit.  With ``_NEAR`` instead, the flow would
-# slowly cross the limit.
+# The flow may move along a limit that it violates by less than this, in the units of ``_NEAR``.  With the value of
+# ``_NEAR``, the flow would slowly cross the limit.
 _SPENT = 9.9e-4
 # Distance that the flow keeps from the joint limits, rad (m).
 _AIM = 2e-3
-# Distance that the flow keeps from the limits of the static controls, as a share of the range.  The slope of the
-# static controls is only estimated, so this distance is larger than ``_AIM``.
+# Distance that the flow keeps from the limits of the static controls, as a share of the range.  This distance is
+# larger than ``_AIM``, because the slope of the static controls is only estimated.
 _RESERVE = 8e-3
-# If the squared length of a row in the free directions is smaller than this, the row is ignored.
+# A row of the limits is ignored if the square of its length along the free directions is smaller than this.
 _FLAT = 1e-6
 _PositiveShare = Annotated[float, Demand(lambda value: 0 < value <= 1, "a number above zero, up to 1")]
 
@@ -45,19 +44,19 @@ class FlowOptions:
 
     Attributes:
         speed: Largest speed ``v`` of an entry of ``q_r``, rad/s (m/s).
-        acceleration: Largest acceleration ``a``, rad/s² (m/s²).  The speed is limited so that ``2a/5`` suffices to
-            stop the flow at the end of its step.
+        acceleration: Largest acceleration ``a`` of an entry of ``q_r``, rad/s² (m/s²).  The flow moves so slowly that
+            the deceleration ``2a/5`` stops it at the end of its step.
         rho: Weight ρ in ``Φ`` (:class:`FlowDirection`) of the squared distance from the start, 1/rad².
         mu: Smallest absolute curvature μ, per rad², relative to ``H₀``.  Smaller absolute curvatures are raised to μ.
-        epsilon: Threshold ε, relative to ``H₀``.  The flow rests if the predicted decrease of ``H`` is below ε, and
-            resumes if it is above 4 ε.
+        epsilon: Threshold ε, relative to ``H₀``.  The flow rests if the predicted decrease of ``H`` is below ε.  The
+            flow resumes if this decrease is above 4 ε.
         duration: Longest time that the flow moves after each start, s.  Time on a path or at rest is not included.
         joint_margin: Distance from the joint limits, rad (m); at most an eighth of the range of a joint.
         com_margin: Distance of the center of mass from the edges of the support polygon, m.
         tilt: Largest angle between the vertical and :attr:`~impact_posture.robot.robot.Robot.upright`, rad.
         share: Share of the actuators' limits that the static controls at ``q_r`` may use.
-        haste: Accelerations may use this share of the control range that the static controls leave.  Braking before a
-            limit may use the share ``(1 + haste)/2``.
+        haste: The static controls leave a part of the control ranges.  Accelerations may use the share ``haste`` of
+            this part.  Braking before a limit may use the share ``(1 + haste)/2``.
         tracking: If the joints of the robot lag behind ``q_r`` by this error, rad (m), the flow stops and waits.
     """
 
@@ -91,7 +90,7 @@ class FlowDirection:
     Attributes:
         B: Estimated curvature of ``H/H₀`` on the constraints, shape (nv, nv).
         T: Estimated slope of the static controls (:class:`StaticControls`), shape (controls, nv).
-        gain: Predicted decrease of ``H/H₀`` by the last step; at most the first-order prediction.
+        gain: Predicted decrease of ``H/H₀`` by the last step; at most the decrease in a first-order prediction.
         failures: Number of steps for which the solver failed; each of these steps is zero.
     """
 
@@ -109,7 +108,7 @@ class FlowDirection:
         self._up = robot.upright
         # Index of the row of the tilt, the tilt angle, and the vertical in base axes.
         self._tilting, self._angle, self._vertical = self._joints.size + edges.shape[0], 0.0, np.zeros(3)
-        # The distance from the start counts joints only.
+        # The distance from the start includes joints, but not the base.
         self._pull = np.full(nv, options.rho)
         self._pull[: robot.first_joint] = 0.0
         self.B, self.gain, self.failures = np.zeros((nv, nv)), 0.0, 0
@@ -191,7 +190,7 @@ class FlowDirection:
         return self._solve(Z, -Z.T @ displacement)
 
     def downhill(self, Z: Array, gradient: Array, flow: Array, stop: Array, step: Array) -> Array:
-        """Return ``step`` without the part that increases ``H`` now or at the point where the flow stops.
+        """Return ``step`` without the part that increases ``H`` here or at the point where the flow stops.
 
         ``step`` is a change of the velocity ``flow``, shape (nv,).  ``Z`` is the basis of the redundancy, shape
         (nv, r), and ``gradient`` is ``∇H/H₀``.  ``stop`` is the displacement within which the flow stops.
@@ -222,7 +221,7 @@ class FlowDirection:
         return math.hypot(self._angle + along, math.sqrt(max(aside, 0.0))) - self._angle
 
     def along(self, Z: Array, flow: Array, time: float, step: Array) -> Array:
-        """Return ``step`` without the parts that cross limits; the limits are treated one after the other.
+        """Remove from ``step`` the parts that cross limits, one limit after the other, and return the rest.
 
         ``step`` is a change of the velocity ``flow``, shape (nv,).  The robot moves with ``flow + step`` for ``time``
         seconds.  ``Z`` is the basis of the redundancy, shape (nv, r).

@@ -13,7 +13,8 @@ from impact_posture.tsid.flow.zero_moment_point import ZeroMomentPoint
 
 # Attempts per candidate of `change`: first unchanged, then twice without the part that crosses limits.
 _ATTEMPTS = 3
-# Least share of the acceleration that the flow assumes for braking, and largest increase of this share per change.
+# The flow assumes a share of the largest acceleration for braking.  This share is at least ``_ABLE``, and increases
+# by at most ``_ABLE`` per change.
 _ABLE = 0.1
 # Safety factor of the braking time, because the slopes of the limits change during braking.
 _CAUTION = 1.5
@@ -21,7 +22,7 @@ _CAUTION = 1.5
 _RATE = 4.8
 # Smallest divisor when a speed is divided by a step, rad (m); prevents a division by zero.
 _TINY = 1e-12
-# Time constant of the return to contacts and tasks, s.
+# Time constant with which ``q_r`` returns to the contacts and to the targets of the tasks, s.
 _RETURN = 0.1
 
 
@@ -51,9 +52,9 @@ class FlowGovernor:
         return self.returning
 
     def stopping(self, flow: Array) -> float:
-        """Return the time in which the velocity ``flow`` stops with constant deceleration, s.
+        """Return the time, s, in which a constant deceleration stops a motion with the velocity ``flow``.
 
-        At constant velocity, the motion in this time would be twice the braking distance.
+        Without deceleration, the motion would cover twice the braking distance in this time.
         """
         return float(np.abs(flow).max()) / self._options.acceleration
 

@@ -11,8 +11,8 @@ from impact_posture.tsid.flow.redundancy import Redundancy
 
 # Least squared length of a direction, which prevents a division by zero.
 _EMPTY = 1e-24
-# If a direction is shorter than this after its orthogonalization, rounding errors are large, so it is orthogonalized
-# twice.
+# A direction that is shorter than this after the orthogonalization is orthogonalized again, because its rounding
+# errors are large.
 _NEW = 0.1
 
 
@@ -34,7 +34,7 @@ class ProbeDirections:
         self.count = 0
 
     def next(self, space: Redundancy) -> Array:
-        """Return the next unit vector, shape (nv,), which is orthogonal to the earlier vectors of the round."""
+        """Return the next unit vector, shape (nv,).  It is orthogonal to the earlier vectors of the round."""
         k = self.count % space.basis.shape[1]
         z, seen = self._seen[k], self._seen[:k]
         z[:] = self._fixed[k]

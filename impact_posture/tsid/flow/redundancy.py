@@ -8,14 +8,14 @@ import numpy as np
 
 from impact_posture.system.arrays import Array
 
-# If the singular value of a direction is below this share of the largest, the direction gets a spring instead of a
-# constraint.  Rows of points on one body can be almost dependent.  As constraints, such rows would switch on and off
-# from posture to posture, and the flow would never rest.
+# A direction gets a spring instead of a constraint if its singular value is below this share of the largest one.
+# Rows of points on one body can be almost dependent.  As constraints, these rows would switch on and off from posture
+# to posture, and the flow would never rest.
 _SOFT = 2e-2
 # Stiffness of the springs relative to ``H₀``, 1/m²: the energy at an error of 6 mm is about half of ``H₀``.
 _STIFFNESS = 3e4
-# This value is added to the diagonal of equations that are singular if the base can move while the joints are at
-# rest.
+# This value is added to the diagonal of the equations of ``back``.  Without it, the equations would be singular if
+# the base can move while the joints are at rest.
 _IDLE = 1e-9
 
 
@@ -58,9 +58,9 @@ class Redundancy:
         return np.asarray(self.basis @ (self.basis.T @ vector))
 
     def back(self, rate: Array, base: int) -> Array:
-        """Return a velocity, shape (nv,), that changes the constraints at ``rate``, shape (rows,).
+        """Return the velocity, shape (nv,), with the slowest joints that changes the constraints at ``rate``.
 
-        Of all such velocities, the result has the slowest joints.  The first ``base`` entries belong to the base.
+        ``rate`` has the shape (rows,).  The first ``base`` entries of the velocity belong to the base.
         """
         back, Z = self.inverse @ rate, self.basis
         if base:

@@ -37,9 +37,10 @@ _REACHED = 0.02
 _STILL = 1e-5
 # Below this speed, rad/s (m/s), the point where the flow would stop is too near for finite differences.
 _SLOW = 1e-3
-# Number of ticks of one update.
+# Number of ticks from one update of the flow to the next.
 UPDATE_TICKS = 14
-# Tick of the first change of the motion in an update; number of ticks from the second change to the next evaluation.
+# ``_UNTIL`` is the tick of the first change of the motion in an update.  ``_SINCE`` is the number of ticks from the
+# second change to the next evaluation.
 _UNTIL, _SINCE = 4, 3
 
 
@@ -47,7 +48,7 @@ class ReferenceFlow:
     """Saddle-free Newton flow of a reference posture ``q_r`` in the null space of contacts and tasks.
 
     ``H`` and ``∇H`` are evaluated at ``q_r`` and not at the measured posture.  Noise, tracking errors and the impact
-    therefore have no influence on them.
+    therefore do not influence ``H`` and ``∇H``.
 
     An update takes :data:`UPDATE_TICKS` ticks.  Four of these ticks (0, 4, 11 and 13) define the motion.  Tick 0
     evaluates ``H``, ``∇H`` and the limits.  Ticks 4 and 11 change the acceleration.  Tick 13 computes the step from
@@ -64,7 +65,7 @@ class ReferenceFlow:
         value: ``H(q_r)`` at the last update.
         start: ``H₀``, the absolute value of ``H`` at the reset.
         on: Whether the flow may move.
-        resting: Whether the flow rests, because the predicted decrease of ``H`` is too small or the time is over.
+        resting: Whether the flow rests because the predicted decrease of ``H`` is too small or its time is over.
         failed: Whether the last evaluation raised an exception or was not finite; the flow then brakes.
         led: Tasks that follow the flow.
         error: Errors of contacts and tasks at the last update, m and rad, then zeros for held joints.
@@ -168,7 +169,7 @@ class ReferenceFlow:
             self._place_at(q)
 
     def rest_at(self, after: float) -> None:
-        """Come to rest within ``after`` seconds from now, as far as the acceleration permits, and stay at rest.
+        """Come to rest within ``after`` seconds, or later if the acceleration limit requires it, and stay at rest.
 
         The time limit ``options.duration`` starts now.
         """
@@ -266,14 +267,14 @@ class ReferenceFlow:
         options = self.options
         period, self._elapsed = self._elapsed, 0.0
         if not period > 0:
-            # No time has passed since the last change.
+            # The previous change was at the same time, so the acceleration is undefined.
             return
         error = np.abs(pin.difference(self._model, measured, self.q)[self._base :]).max(initial=0.0)
         fastest = options.speed * max(1.0 - error / options.tracking, 0.0)
         if self.on and not self.resting and self._visited == len(self._path):
             self._moved += period
-        # The flow keeps this speed until the next change.  From there on, 2/5 of the acceleration must suffice to
-        # stop the flow in the remaining time.
+        # The flow keeps its speed until the next change.  After that change, 2/5 of the largest acceleration must
+        # suffice to stop the flow in the remaining time.
         self._remains = min(self._deadline - self._clock, options.duration - self._moved) - 2 * period
         fastest = min(fastest, 0.4 * options.acceleration * max(self._remains, 0.0))
         if not self.on:

@@ -16,23 +16,22 @@ from impact_posture.tsid.support_contact import SupportContact
 
 # Weight of a moment (N·m), relative to a force (N), in the norm of contact wrenches.
 _MOMENT = 100.0
-# Accelerations may always use at least this share of the half range of a control.
+# Accelerations may use at least this share of the half range of a control, even if the static controls leave less.
 _LEFT = 0.1
 # Each of n soles carries at least this share of the weight, divided by n.
 _EVEN = 0.6
 # If the direction of an edge is within this angle of −π, rad, the edge is sorted as if its direction were +π.
 _START = 1e-8
-# This share of the trace is added to the diagonal, so that the equations are solvable even if the feet cannot carry
-# every wrench on the base.
+# This share of the trace is added to the diagonal of the equations of the contact wrenches.  The equations are then
+# solvable even if the feet cannot carry every wrench on the base.
 _TINY = 1e-12
 
 
 class StaticControls:
     """Static controls ``u = G⁺(h − Jᵀf)``, measured from the middle of the control ranges.
 
-    The value ±1 means that a control uses the permitted share of its limits.  Of all contact wrenches ``f`` that
-    carry the base, the result uses the wrenches with the least weighted norm.  Redundant rotors share the load
-    evenly.
+    The value ±1 means that a control uses the permitted share of its limits.  Many contact wrenches ``f`` can carry
+    the base; the class uses the wrenches with the least weighted norm.  Redundant rotors share the load evenly.
 
     Attributes:
         limited: Controls that have limits, shape (m,).
@@ -44,7 +43,8 @@ class StaticControls:
         self.limited = np.flatnonzero(np.isfinite(actuators.upper) & np.isfinite(actuators.lower))
         lower, upper = actuators.lower[self.limited], actuators.upper[self.limited]
         self._middle, self._half = (upper + lower) / 2, share * (upper - lower) / 2
-        # Full range, and least range that accelerations may use; both in units of the permitted half range.
+        # ``_whole`` is half of the full range.  ``_least`` is the least range that accelerations may use.  Both are
+        # in units of half of the permitted range.
         self._whole, self._least = 1.0 / share, _LEFT / share
         wrench = np.array([1.0] * 3 + [_MOMENT] * 3)
         self._ease = 1.0 / np.concatenate([np.zeros(0), *(wrench[: c.size] for c in contacts)])
@@ -101,11 +101,11 @@ class StaticControls:
 def support_edges(state: State, contacts: Sequence[SupportContact]) -> tuple[Array, Array]:
     """Return ``n`` (k, 2) and ``b`` (k,) of the polygon ``n·c + b ≤ 0`` of the feet on level ground, m.
 
-    If the center of mass ``c`` is in the polygon, each of n soles carries at least 60 %/n of the weight, because a
-    sole without load would leave the ground at the smallest push.  To achieve this, each corner of a sole is moved
-    towards the mean of the same corners of all soles.  Point feet are not moved, because three of four feet can carry
-    a robot.  If the feet do not span an area, the result is four edges with infinite ``b``, which prevent any motion
-    of the center of mass.
+    If the center of mass ``c`` is in the polygon, each of n soles carries at least 60 %/n of the weight.  A sole
+    without load would leave the ground at the smallest push.  Therefore, each corner of a sole is moved towards the
+    mean of the same corners of all soles.  Point feet are not moved, because three of four feet can carry a robot.
+    If the feet do not span an area, the result has four edges with infinite ``b``.  These edges prevent any motion of
+    the center of mass.
 
     Raises:
         InputError: The robot has contacts, but its base is fixed.

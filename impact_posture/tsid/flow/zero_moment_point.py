@@ -15,16 +15,17 @@ from impact_posture.tsid.support_contact import SupportContact
 _SHARE = 0.8
 # A shorter distance from the center of mass to an edge is replaced by this distance, m.
 _LEAST = 0.01
-# If the squared length of a row in the free directions is smaller than this, the row is ignored.
+# A row of the bounds is ignored if the square of its length along the free directions is smaller than this.
 _TINY = 1e-12
 
 
 class ZeroMomentPoint:
     """Bounds on the acceleration that keep the zero moment point ``z`` in a polygon ``n·z + b ≤ 0`` on the floor.
 
-    The ground forces equal the first six rows of ``h + M ν̇``: a force ``f`` and a moment ``τ`` about the base
-    origin ``p``.  With the ``height`` of ``p`` above the ground, the moments about horizontal axes vanish at
-    ``z = (p_x − (τ_y + height f_x)/f_z, p_y + (τ_x − height f_y)/f_z)``.  Hence ``f_z (n·z + b)`` is linear in ``ν̇``.
+    The first six rows of ``h + M ν̇`` are the ground force ``f`` and its moment ``τ`` about the base origin ``p``.
+    ``height`` is the height of ``p`` above the ground.  The moments about horizontal axes vanish at
+    ``z = (p_x − (τ_y + height f_x)/f_z, p_y + (τ_x − height f_y)/f_z)``.  Hence ``f_z (n·z + b)`` is linear in
+    ``ν̇``.
     """
 
     def __init__(self, edges: Array, offsets: Array, state: State, contacts: Sequence[SupportContact]) -> None:

@@ -28,8 +28,8 @@ class LimitLaw:
 
     Attributes:
         approach: Permitted speed towards a limit, divided by the distance from the limit, 1/s.
-        rate: Gain of the speed error, 1/s; at least ``4·approach``, because the joint could otherwise swing through
-            its limit.
+        rate: Permitted acceleration, divided by the difference between the permitted and the present speed, 1/s.  It
+            is at least ``4·approach``; otherwise, a joint could swing through its limit.
         deceleration: Deceleration available for braking, rad/s² (m/s²).
         acceleration: Largest acceleration of a joint, rad/s² (m/s²); infinite means no bound.
         margin: Distance from a position limit at which joints stop, rad (m); limited to a quarter of the joint's
@@ -58,7 +58,7 @@ class AccelerationBounds:
     """
 
     def __init__(self, robot: Robot, law: LimitLaw, lower: Array | None = None, upper: Array | None = None) -> None:
-        """Allocate the bounds, or write them into the arrays ``lower`` and ``upper``, shape (nv,), if given."""
+        """Store the bounds in the arrays ``lower`` and ``upper``, shape (nv,), or in new arrays for ``None``."""
         ranges, nv = JointRanges(robot), robot.nv
         self.law = law
         self.lower = np.full(nv, -np.inf) if lower is None else lower

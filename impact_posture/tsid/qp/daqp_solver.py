@@ -1,4 +1,4 @@
-"""DAQP solver with a workspace that is reused at each tick; a variant first makes the Hessian the identity."""
+"""DAQP solver with a workspace that all ticks share, and a variant that first makes the Hessian the identity."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import numpy as np
 
 from impact_posture.tsid.qp.quadratic_program import QP, Solved
 
-# Exit flags of DAQP: 1 and 2 mean solved (2: soft constraints are active); -1 means infeasible.  Flag 4 is not a
-# solution, because the answer violates bounds after a cycle.  Flag -6 (dependent equations) does not mean infeasible,
+# Exit flags of DAQP.  ``SOLVED`` contains 1 and 2 (2: soft constraints are active).  ``_NONE`` means infeasible.
+# After flag 4 (a cycle), the answer violates bounds.  Flag -6 (dependent equations) does not prove infeasibility,
 # because DAQP also returns -6 if bounds of the last active set depend on each other.
 SOLVED, _NONE = (1, 2), -1
 # Exit flag of this class for a failure of the solver, which says nothing about feasibility.
@@ -22,14 +22,14 @@ SETTINGS = {"primal_tol": 1e-9, "iter_limit": 1000, "sing_tol": 1e-13}
 class DaqpSolver:
     """DAQP (Arnström, Bemporad, Axehill 2022) with one workspace.  Each call starts from the last active set.
 
-    After a reset, equal programs give answers that are equal in every bit.
+    After a reset, equal quadratic programs give solutions that are equal in every bit.
     """
 
     def __init__(self, n: int, m: int, *, proximal: float | None = None) -> None:
         """Allocate a workspace for ``n`` variables and ``m`` rows.
 
-        ``proximal`` is the weight of proximal-point iterations; with ``None``, DAQP decides whether to use them.
-        These iterations need more time, but can solve programs whose cost is too flat for one factorization.
+        ``proximal`` is the weight of proximal-point iterations.  With ``None``, DAQP decides whether to use them.
+        These iterations take more time, but they also solve a program whose Hessian is nearly singular.
         """
         self._flag = 1
         self._model = daqp.Model()
@@ -64,9 +64,9 @@ class DaqpSolver:
 class WhitenedSolver(DaqpSolver):
     """DAQP with the change of variables ``y = Rz``, where LAPACK factorizes ``H = RᵀR``.
 
-    Without this class, DAQP factorizes ``H`` by plain loops, which need most of its time for a humanoid.  LAPACK and
-    one matrix product need half of the time of these loops.  Bounds on the dense variables become rows.  The rest of
-    ``H`` must be diagonal.
+    DAQP alone factorizes ``H`` by plain loops, which take most of the solution time for a humanoid.  LAPACK and one
+    matrix product take half as long as these loops.  Bounds on the dense variables become rows.  The rest of ``H``
+    must be diagonal.
     """
 
     def __init__(self, n: int, m: int, dense: int) -> None:

@@ -1,4 +1,4 @@
-"""Lexicographic least squares: each level comes as close to its bounds as the levels above permit."""
+"""Lexicographic least squares: each level violates its bounds as little as the more important levels permit."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from impact_posture.tsid.qp.quadratic_program import EQUALITY, INEQUALITY
 # Bounds are scaled so that none exceeds this value, because the tolerances of DAQP are absolute.
 _LARGEST = 1e4
 # Tolerances within which a row is at its bound, relative to the norm of the row times the norm of z.  The refinement
-# uses the first tolerance that does not make the answer worse.
+# uses the first tolerance with which the refined solution is not worse than the solution of DAQP.
 _AT = (1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4)
 # Singular values of rows below this value, relative to the spectral norm, are treated as zero.
 _RANK = 1e-9
@@ -52,8 +52,8 @@ def lexicographic(levels: Sequence[Level], units: Array | float = 1.0) -> Array 
     if missed:
         whole = _stacked(scaled[: missed + 1])
         if _holds(whole, _onto(whole, y)):
-            # DAQP violated a level that is feasible together with the levels above.  Join these levels, and solve
-            # again.
+            # DAQP violated a level that is feasible together with the more important levels.  Join these levels, and
+            # solve again.
             return lexicographic([_stacked(levels[: missed + 1]), *levels[missed + 1 :]], units)
     return np.asarray(units * y)
 

@@ -14,8 +14,8 @@ from impact_posture.tsid.smooth_step import smooth
 # A direction is damped if its singular value, divided by the length of the level's longest row, is smaller than this.
 # In the home postures of all shipped robots, this ratio is above 0.03.
 SINGULAR = 2e-2
-# Directions are removed if their singular value is below this share of SINGULAR.  The share is far above rounding
-# errors, but too small for a visible effect.
+# Directions are removed if their ratio (see ``SINGULAR``) is below this share of ``SINGULAR``.  The share is far
+# above rounding errors, but too small for a visible effect.
 _NOTHING = 1e-9
 # Least ``1 − α``, which limits the weight ``α/(1 − α)`` of a damped row.
 _LEAST = 1e-8
@@ -24,20 +24,20 @@ _LEAST = 1e-8
 class LevelRank:
     """Keep the strict levels of a QP independent of each other and of the dynamics.
 
-    A level with rows ``J`` acts in the space that the levels above leave free.  With the basis ``Z`` of this space,
-    ``J Z = U S Vᵀ``.  The rows are rotated by ``Uᵀ``, which does not change the sum of squares.  Each rotated row
-    then belongs to one singular value ``s``.  ``s₀`` is :data:`SINGULAR` times the length of the level's longest
+    A level with rows ``J`` acts in the space that the more important levels leave free.  With the basis ``Z`` of this
+    space, ``J Z = U S Vᵀ``.  The rows are rotated by ``Uᵀ``, which does not change the sum of squares.  Each rotated
+    row then belongs to one singular value ``s``.  ``s₀`` is :data:`SINGULAR` times the length of the level's longest
     row.  With ``x = s/s₀``:
 
     - ``x ≥ 1``: the row is an equation.
-    - ``x = 0``: the levels above determine the row, or the row contradicts other rows of its level.  The row is
+    - ``x = 0``: more important levels determine the row, or the row contradicts other rows of its level.  The row is
       removed from the QP.  The other rows give the least-squares answer of the level.
     - Otherwise, the row is damped: it becomes a term ``α/(1 − α) (q·ν̇ − c/s)² + x (q·ν̇)²`` of the cost, with
       ``α = x²(3 − 2x)``.  ``q = Zv`` is the row's direction of motion (not the configuration), where ``v`` is
       the column of ``V`` that belongs to ``s``.  ``c`` is the row's right-hand side.  The term is multiplied by the
-      mean weight of the accelerations in the cost.  With decreasing ``x``, the row changes smoothly from an equation
-      to nothing, so accelerations are continuous through a singular posture.  The accelerations are at most ``3/s₀``
-      times ``c``.  The levels below can use the direction with the factor ``√(1 − α)``.
+      mean weight of the accelerations in the cost.  With decreasing ``x``, the influence of the row decreases
+      smoothly to zero, so accelerations are continuous through a singular posture.  The accelerations are at most
+      ``3/s₀`` times ``c``.  In the less important levels, the direction has the factor ``√(1 − α)``.
 
     The result depends only on the present rows and on their lengths at reset.  While all rows are independent, all of
     them remain equations.  A singular value changes at most by the norm of the change of the matrix (Weyl 1912), so
@@ -90,7 +90,7 @@ class LevelRank:
         self.changed = self.qp is not before and not np.array_equal(self.qp.sense, before.sense)
 
     def rows(self, rows: slice, equations: bool) -> NDArray[np.intp]:
-        """Return the rows of a level that are equations, or the other rows if ``equations`` is false."""
+        """Return the rows of a level that are equations; if ``equations`` is false, return the other rows."""
         n = self._full.n
         held = self.qp.sense[n + rows.start : n + rows.stop] == EQUALITY
         return np.asarray(np.arange(rows.start, rows.stop)[held == equations])

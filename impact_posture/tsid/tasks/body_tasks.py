@@ -29,8 +29,8 @@ class _BaseTurn(TargetTask[Array]):
 class Tilt(_BaseTurn):
     """Regulate the direction of the base's z axis (reduced attitude); the yaw angle stays free (2 × nv).
 
-    ``e`` consists of the x and y components, in base axes, of the shortest rotation from the base's z axis to
-    ``target`` (Brescianini and D'Andrea 2018).  ``J`` selects ``ω_x`` and ``ω_y`` from ν, hence ``J̇ν = 0``.
+    The shortest rotation takes the base's z axis to ``target``.  ``e`` contains its x and y components in base axes
+    (Brescianini and D'Andrea 2018).  ``J`` selects ``ω_x`` and ``ω_y`` from ν, hence ``J̇ν = 0``.
 
     Attributes:
         target: Desired direction of the base's z axis, unit vector in the world, shape (3,); upward by default.

@@ -192,7 +192,7 @@ class FrameAligned(FrameTask[pin.SE3]):
         return np.concatenate([target.translation - here.position, turn])
 
     def select(self, here: PointState, six: Array) -> Array:
-        """Return the linear rows and the two angular components across the axis.
+        """Return the linear rows and the two angular components orthogonal to the axis.
 
         This also holds for accelerations, because ``d(Rᵀω)/dt = Rᵀω̇``.
         """

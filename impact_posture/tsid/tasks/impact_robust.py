@@ -77,9 +77,9 @@ class ImpactRobustPosture(JointPosture):
       ``λ``, ``K`` is a stiffness in 1/s² like ``K_p`` on every robot, although ``H`` scales with 1/armature².  Near
       an optimum with the curvature ``λ*``, the term is a spring with the stiffness ``K λ*/λ``.  This stiffness can be
       several times ``K``, because ``λ`` is the curvature at the start, where ``H`` may even be concave.
-    - By default, ``K_d = 2√(K_p + K)``, which is critical damping for the sum of both stiffnesses if ``λ* = λ``.
-    - The length of the term is at most ``K·reach``, the force of a spring ``K`` that is stretched by ``reach``.  If
-      this bound were below ``K_p|q_des ⊖ q|``, the robot would stop before the optimum.
+    - By default, ``K_d = 2√(K_p + K)``.  If ``λ* = λ``, this is critical damping for the sum of both stiffnesses.
+    - The length of the term is at most ``K·reach``, as for a spring with the stiffness ``K`` and the length
+      ``reach``.  If this bound were below ``K_p|q_des ⊖ q|``, the robot would stop before the optimum.
     - ``s(q)`` fades out the part of the term that pushes a joint into a position limit.  The fade begins
       ``fade[1]`` rad before the limit and ends ``fade[0]`` rad before the limit.  ``fade[1]`` is limited to a quarter
       of the joint's range, and ``fade[0]`` to a sixteenth.  Without ``s(q)``, the robot would move to its mechanical
@@ -124,7 +124,7 @@ class ImpactRobustPosture(JointPosture):
 
         Args:
             robot: The robot.
-            gradient: Function ``q → (H, ∇H)``, or a compiled export, whose exported objective is used.
+            gradient: Function ``q → (H, ∇H)``, or a compiled export with its exported objective.
             target: Target posture ``q_des``, shape (nq,); by default, the posture at ``reset``.
             K: Gain, 1/s².
             name: Name in reports.

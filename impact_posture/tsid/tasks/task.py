@@ -63,7 +63,7 @@ class Task(ABC):
 
     @abstractmethod
     def error(self, state: State) -> Array:
-        """Return the error ``e`` from ``y`` to its target, shape (k,), with ``ė = ẏ_des − Jν`` to first order."""
+        """Return the error ``e`` from ``y`` to the target, shape (k,).  To first order, ``ė = ẏ_des − Jν``."""
 
     @abstractmethod
     def jacobian(self, state: State) -> Array:
