@@ -36,7 +36,8 @@ class Layout:
         graph: The graph.
         blocks: The blocks in the order in which they are called.
         inlined: Nodes that are computed inside the statement of the only operation that uses them.
-        slots: Node that a later block uses → index of its value in the work array.  Each width has a work array.
+        slots: Node that a later block uses → index of the node's value in the work array.  Each width has a work
+            array.
         sizes: Width → length of the work array for values of this width.
         angles: Input nodes whose sine and cosine are computed, in the order of the arrays of sines and cosines.
         trig: Sine or cosine node → index of its first value in the array of sines or cosines.
@@ -98,8 +99,8 @@ def lay_out(
 def _slots(graph: Graph, blocks: Sequence[Block], last: Mapping[int, int]) -> tuple[dict[int, int], dict[int, int]]:
     """Return indices in the work arrays for values that later blocks use, and the lengths of the arrays.
 
-    All functions call blocks in the same order.  After the ``last`` block that uses a value, its index can therefore
-    store another value.
+    All functions call blocks in the same order.  After the ``last`` block that uses a value, another value can
+    therefore use the same index.
     """
     slots: dict[int, int] = {}
     sizes: dict[int, int] = {}
@@ -155,7 +156,7 @@ def depth_first(graph: Graph, roots: Sequence[int]) -> list[int]:
 
 
 def _trig(graph: Graph, order: Sequence[int]) -> tuple[tuple[int, ...], dict[int, int]]:
-    """Return ``angles`` and ``trig`` of :class:`Layout`; vectors come first, which aligns them."""
+    """Return ``angles`` and ``trig`` of :class:`Layout`; vectors come first, so that they are aligned in memory."""
     trigonometric = [k for k in order if graph.nodes[k].op in (SINE, COSINE)]
     starts: dict[int, int] = {}
     angles: list[int] = []

@@ -15,7 +15,8 @@ from impact_posture.codegen.block_layout import Block, Layout
 from impact_posture.codegen.c_literals import Real
 from impact_posture.codegen.expression_graph import COSINE, Node
 
-# Length of a reference to a constant in a table, such as K[1234].  Shorter literals are written directly.
+# Number of characters of a reference to a table of constants, such as K[1234].  Shorter literals are written
+# directly.
 _PLACE = 7
 SHORT_NAMES = ("APART", "K", "K2", "K4", "V2", "V2u", "V4", "V4u", "VN")
 """Names of the macros that the generated C file defines, and undefines at its end."""
@@ -83,8 +84,8 @@ class Emitter:
     """C code of the blocks of one layout.
 
     The names of blocks begin with ``prefix``.  ``types`` maps a width to its C type.  ``size`` is the size in bytes
-    of the type of width one; by default, the size of ``real``.  ``work`` is the name of the C structure that contains
-    inputs and work arrays; empty if the inputs are separate arguments.
+    of the type of width one; by default, the size of ``real``.  ``work`` is the name of the C structure with inputs
+    and work arrays.  ``work`` is empty if the inputs are separate arguments.
     """
 
     def __init__(

@@ -21,7 +21,7 @@ class Real:
     Attributes:
         name: C name of the type, ``double`` or ``float``.
         size: Size of a number, bytes.
-        unit_tolerance: Largest permitted difference from 1 of the norm of a quaternion or cosine-sine pair.
+        unit_tolerance: Largest permitted difference between 1 and the norm of a quaternion or cosine-sine pair.
     """
 
     name: str

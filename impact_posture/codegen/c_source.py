@@ -22,22 +22,22 @@ from impact_posture.system.libraries import source_key
 LARGEST_VECTOR = 64
 """Size of the widest vectors, bytes.  A batch computes narrower vectors in groups of at most this total size."""
 
-# Stack bytes for return addresses, saved registers, alignment and the variables of the small functions.  The macro
-# APART prevents the compiler from inlining blocks, so the stack contains the variables of only one block at a time.
+# Stack bytes for return addresses, saved registers, alignment and the variables of the small functions.  The stack
+# contains the variables of only one block at a time, because the macro APART prevents the inlining of blocks.
 _FRAMES = 2048
-# With -march=native, a compiler can combine neighboring numbers to vectors.  A number may then be stored in several
-# vectors, which takes up to this many times the stack.
+# With -march=native, a compiler can combine neighboring numbers to vectors.  The stack then grows by up to this
+# factor, because several vectors may contain the same number.
 _SPILL = 2
 
 # Largest number of statements in a block of a batch.  The instructions of such a block stay in the first-level cache
 # while the block computes one group of configurations after the other.
 _BATCH_BLOCK = 60
 
-# Up to this number of operations, the blocks of a CUDA function are inlined, so that its values can be in registers.
-# For longer functions, the compiler stores fewer values in memory if the blocks are separate functions.
+# Up to this number of operations, the blocks of a CUDA function are inlined, so that values can stay in registers.
+# In longer functions, separate blocks make the compiler store fewer values in memory.
 _INLINED = 6000
-# Largest number of statements in a block that is not inlined.  On an H100, talos in double precision reaches
-# 105 million evaluations/s with 600 statements, 95 with 300, and 91 with 200 or 1,000.
+# Largest number of statements in a CUDA block that is not inlined.  On an H100, talos in double precision reaches
+# 105 million evaluations/s with 600 statements, 95 million with 300, and 91 million with 200 or 1,000.
 _CUDA_BLOCK = 600
 
 
@@ -48,7 +48,7 @@ class CudaSource:
     Attributes:
         inlined: Whether the blocks are inlined.
         constants: Definitions of the tables of constants.
-        functions: Template variables of each function: as in :attr:`CSource.functions`, and also ``blocks``,
+        functions: Template variables of each function: the variables in :attr:`CSource.functions`, ``blocks``,
             ``angles`` and ``work`` (length of the work array).
     """
 
@@ -73,8 +73,8 @@ class CSource:
             ``outputs`` (target, value, whether the value is constant), and ``finite`` (name and length of each
             result).
         batches: Template variables of each batch function: ``stem``, ``normal``, ``scale`` (C literal of the ratio of
-            the objective to ``H``; empty if the ratio is not constant), and ``blocks``.  With blocks also ``angles``,
-            ``room``, ``work`` and ``outputs``.  Without blocks, the batch is a loop over single calls.
+            the objective to ``H``; empty if the ratio is not constant), and ``blocks``.  A batch with blocks also has
+            ``angles``, ``room``, ``work`` and ``outputs``.  A batch without blocks is a loop over single calls.
         stack_bytes: Upper bound on the stack that a call uses, in bytes, without the functions of the C library.
         cuda: CUDA code of the same functions; ``None`` if it was not requested.
     """
@@ -143,8 +143,7 @@ def _generate(
         scale = real.literal(v.objective.scale) if v.objective.is_multiple_of_H else ""
         batch = {"stem": v.stem, "normal": v.objective.contact.normal, "scale": scale, "blocks": ()}
         function = next(f for f in library.functions if (f.stem, f.name) == (v.stem, "eval"))
-        # Vector code for the batch of the robot without supports would make the file a third longer, so this batch is
-        # a loop.
+        # For the robot without supports, the batch is a loop, because vector code would make the file a third longer.
         if not portable and not v.free and (lanes := _lanes(function, scalars, real, constants)):
             held = 2 * lanes["room"] + lanes["work"] + robot.nq + 3 + 2 * (1 + robot.nv)
             frame = max((block.local_bytes for block in lanes["blocks"]), default=0)

@@ -45,8 +45,8 @@ _ORACLE_TOLERANCE = 1e-5
 _SAMPLES = 20
 # Largest number of libraries in the cache; if there are more, the oldest are deleted.
 _CACHED = 16
-# Name of a gradient → name of its value.  The error of a gradient is relative to its largest entry, or to ``_SHARE``
-# times the value if this is larger.
+# Name of a gradient → name of the quantity whose gradient it is.  The error of a gradient is relative to the largest
+# entry of the gradient, or to ``_SHARE`` times the quantity if this product is larger.
 _LEAST = {"grad": "H", "objective_grad": "objective"}
 _SHARE = 1e-3
 
@@ -92,8 +92,8 @@ def compile_and_check(
 def _cached_library(export_dir: Path, prefix: str) -> Path | None:
     """Return the library of an export from the cache; build it if it is missing.
 
-    Return ``None`` if the cache is not writable.  Compiling the code of a humanoid takes seconds, and many exports
-    differ only in the constant posture.
+    Return ``None`` if the cache is not writable.  The cache saves time, because compiling the code of a humanoid
+    takes seconds and many exports differ only in the constant posture.
     """
     source = read_text(export_dir / f"{prefix}.c")
     content = [re.sub(rf"^const \w+ {prefix}_(posture|manifest)\[.*?;$", "", source, flags=re.DOTALL | re.MULTILINE)]
@@ -119,8 +119,8 @@ def largest_difference(
 ) -> float:
     """Return the largest relative difference between an export and a reference at random postures and normals.
 
-    ``build_reference`` is :func:`~impact_posture.codegen.self_test.casadi_reference` or ``oracle_reference``.  If a C
-    function returns an error code, the difference is infinite.
+    ``build_reference`` is :func:`~impact_posture.codegen.self_test.casadi_reference` or ``oracle_reference``.  The
+    difference is infinite if a C function returns an error code.
     """
     reference = build_reference(objective)
     normals = np.random.default_rng(2).normal(size=(samples, 3))

@@ -130,13 +130,13 @@ def export(
     Args:
         objective: The objective, or several objectives of one robot at different frames.  Several objectives become
             one library with functions such as ``<prefix>_<frame>_eval``.
-        out: The existing folder.
+        out: The folder, which must exist.
         prefix: Text with which all C names begin, a C identifier; by default, names of robot and frame.
         posture: Configuration that the code contains as a constant, shape (nq,); ``None`` for no constant.
         compression: Duration and peak force of the impact (:class:`Compression`), for the manifest and the header.
         real: Floating-point type of the code.
         portable: Write plain C99 without vectors, for compilers other than GCC and Clang.
-        cuda: Also write ``<prefix>.cuh``, the same functions as device code with kernels for batches, and an example.
+        cuda: Also write an example and ``<prefix>.cuh``: the same functions as device code, with kernels for batches.
         force: Replace existing files.
         check: Compile the code, and compare its results with CasADi and Pinocchio.
 
@@ -161,8 +161,8 @@ def export(
     if posture is not None:
         stated = np.array(posture, dtype=float)
         posture = robot.check_posture(stated, limits=False)
-        # Normalization can change the last digits of a normalized posture.  Keep the given digits, so that the code
-        # contains the same numbers as result.json.
+        # Keep the digits of ``posture``, because normalization can change the last digits of a normalized posture.
+        # The code then contains the same numbers as result.json.
         posture = stated if np.allclose(stated, posture, rtol=0, atol=1e-9) else posture
     exported, code = cached_code(tuple(objectives), prefix, real, portable, cuda)
     manifest = build_manifest(
@@ -211,9 +211,9 @@ def write_export(
     ``force`` replaces an earlier export.  The other arguments are the same as in :func:`export`.
 
     Raises:
-        OutputError: The folder exists and ``force`` is False, it is not an export, or it is not writable.
+        OutputError: The folder exists and ``force`` is False, the folder is not an export, or it is not writable.
         CompilerError: The compiler failed, or the results of the compiled code are wrong.  Nothing is written.
-        ImpactPostureError: As in :func:`export`.
+        ImpactPostureError: The other errors of :func:`export`.
     """
     prefix = default_prefix(objectives) if prefix is None else check_prefix(prefix)
     out = Path(f"{prefix}-c") if out is None else out

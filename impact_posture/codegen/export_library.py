@@ -25,7 +25,7 @@ class NamedObjective:
         objective: The objective.
         stem: Text with which the C names of the objective begin.
         free: Whether this objective ignores the supports of a standing robot.
-        joint: Whether this objective is for several simultaneous contacts; ``H`` is then not exported.
+        joint: Whether this objective is for several simultaneous contacts.  ``H`` is not exported for it.
     """
 
     objective: WorstCaseObjective
@@ -47,7 +47,7 @@ def named_objectives(objectives: Sequence[WorstCaseObjective], prefix: str) -> t
     if several and len(objectives) > 1:
         what = "a several-contact objective cannot be exported with others"
         raise InputError(what, where="codegen", hint="export each objective separately")
-    # The normal is a parameter of H, so a frame with two contacts needs only one H.
+    # A frame with two contacts needs only one H, because the normal is a parameter of H.
     singles: dict[str, WorstCaseObjective] = {}
     for single in (single for objective in several for single in objective.singles):
         singles.setdefault(single.contact.frame, single)
@@ -110,8 +110,8 @@ class ExportLibrary:
 def export_library(exported: Sequence[NamedObjective]) -> ExportLibrary:
     """Return the expressions of the objectives of one robot.
 
-    ``V``, and an ``objective`` that is a multiple of ``H``, have no expression, because the C code computes both from
-    ``H`` and ``G``.
+    ``V`` has no expression, because the C code computes it from ``H`` and ``G``.  An ``objective`` that is a multiple
+    of ``H`` has no expression either.
     """
     robot = exported[0].objective.robot
     model, q, n = robot.model, ca.SX.sym("q", robot.nq), ca.SX.sym("n", 3)

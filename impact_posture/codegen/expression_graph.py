@@ -11,8 +11,8 @@ import casadi as ca
 
 from impact_posture.errors import CompilerError
 
-# Operations that C can apply to vectors.  Divisions become products with a reciprocal ("inv"), because several
-# divisions by the same number need the reciprocal only once.
+# Operations that C can apply to vectors.  A division becomes a product with a reciprocal ("inv"), because several
+# divisions by the same number share one reciprocal.
 ARITHMETIC = frozenset({"+", "-", "*", "neg", "inv"})
 _COMMUTE = frozenset({"+", "*"})
 # Functions with the same name in C and in CasADi.  The first tuple lists functions of one argument.

@@ -25,9 +25,10 @@ Array = NDArray[Any]
 
 _TYPES: dict[str, Any] = {"double": ctypes.c_double, "float": ctypes.c_float}
 # Relative tolerance for rounding errors in the comparison with the reference values of the manifest.  In float, few
-# of the seven digits are correct if the robot has supports with compliance ε (condition number about 1/ε).
+# of the seven digits are correct for a robot with supports.  Their compliance ε causes a condition number of about
+# 1/ε.
 _SELF_TEST = {"double": 1e-7, "float": 0.1}
-# Fewest rows of a batch for which a thread is started.
+# Least number of rows of a batch that each thread computes.
 _LEAST_ROWS = 256
 
 
@@ -106,8 +107,8 @@ class ImpactGradient:
 
         Raises:
             SpecError: The export does not exist or is damaged.
-            ManifestMismatch: Robot, joint order or convention differ, or the library belongs to another manifest.
-                The error names the first difference.
+            ManifestMismatch: The robot, the joint order or a convention of the export differs, or the library belongs
+                to another manifest.  The error names the first difference.
             FrameNotFound: The export has no such frame.  The error lists its frames.
             CompilerError: The library is missing and cannot be built.
         """
@@ -223,11 +224,11 @@ class ImpactGradient:
     def objective_batch(
         self, q: ArrayLike, out: tuple[Array, Array] | None = None, *, threads: int = 1
     ) -> tuple[Array, Array]:
-        """Return the objective, shape (N,), and its tangent gradients, as :meth:`value_and_gradient_batch` does.
+        """Return the objective, shape (N,), and its tangent gradients, as in :meth:`value_and_gradient_batch`.
 
         Raises:
             InputError: A shape or a type is wrong.
-            SpecError: An earlier version wrote the export, without this function.
+            SpecError: An earlier version wrote the export, which therefore lacks this function.
         """
         if "objective" not in self._batches:
             raise SpecError("has no objective_batch", where=str(self.manifest["prefix"]), hint="run codegen again")

@@ -1,7 +1,7 @@
 """Order operations limb by limb, for processors with few registers.
 
 A sweep over the kinematic tree visits each limb once.  A limb has few values, and the body passes few values between
-limbs.  Therefore, few values must be kept at a time if each visit of a limb is computed in one piece.
+limbs.  If each visit of a limb is computed without interruption, the processor must keep only a few values at a time.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ def order_by_limb(graph: Graph, outputs: Sequence[str], limb_of: Mapping[int, in
 def _limbs(graph: Graph, order: Sequence[int], leaves: set[int], limb_of: Mapping[int, int]) -> dict[int, int]:
     """Return node → limb on whose joints the node depends; 0 if it depends on no limb or on several limbs.
 
-    A value of the body and of one limb belongs to the limb.  But if only the body uses this value, it is a partial
-    sum over limbs and belongs to the body.
+    A value that depends on the body and on one limb belongs to the limb.  If only the body uses this value, it is a
+    partial sum over limbs and belongs to the body.
     """
     nodes, limb = graph.nodes, dict[int, int]()
     users: dict[int, set[int]] = {}

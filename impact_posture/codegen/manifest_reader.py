@@ -91,8 +91,8 @@ def read_checked(
 ) -> tuple[dict[str, Any], _Checked, Path]:
     """Read and validate a manifest; return its content, the validated ``model``, and the path of the file.
 
-    ``path`` is the folder, or the manifest file.  In error messages, ``what`` is the name for the content of the
-    folder, and ``command`` is the command that writes the folder.
+    ``path`` is the folder or the manifest file.  Error messages call the content of the folder ``what``, and name
+    the ``command`` that writes the folder.
 
     Raises:
         SpecError: The folder has no manifest or several manifests, or the manifest is damaged.

@@ -73,7 +73,8 @@ def _bundles(
     """
     bundles: dict[int, tuple[int, ...]] = {}
     lanes: dict[int, tuple[int, int]] = {}
-    # Node → number that represents it in keys: the first node of its vector, or the node itself without a vector.
+    # Node → number that represents the node in keys: the first node of its vector.  A node without a vector
+    # represents itself.
     short = list(range(len(graph.nodes)))
     for level in levels:
         by_key: dict[Key, dict[int, list[int]]] = {}
@@ -98,8 +99,8 @@ def _place(
 ) -> tuple[Key, tuple[int, int]] | None:
     """Return the key of a node, and its group and lane.
 
-    Return ``None`` if the node cannot be in a vector, because its operands are in no lane or in several lanes, or
-    because C cannot apply the operation to vectors.
+    Return ``None`` if the node cannot be in a vector.  Either its operands are in no lane or in several lanes, or C
+    cannot apply the operation to vectors.
     """
     node = graph.nodes[k]
     if k in places:

@@ -32,8 +32,8 @@ _UPRIGHT = pin.SE3(pin.rpy.rpyToMatrix(np.pi / 2, 0.0, 0.0), np.zeros(3))
 class Geometry(NamedTuple):
     """The shapes of a robot at their joints, without pairs, and the link of each shape.
 
-    ``apart``, shape (n, n), tells whether two shapes must not touch.  ``warnings`` has a line for each shape that is
-    left out or changed.
+    ``apart``, shape (n, n), tells whether two shapes must not touch.  ``warnings`` has one line for each shape that
+    is left out or changed.
     """
 
     model: pin.GeometryModel
@@ -52,7 +52,7 @@ def load_geometry(robot: Robot, described: list[LinkShape]) -> Geometry:
     model, largest = robot.model, largest_extent(robot)
     kept, solids, warnings = [], [], []
     read_meshes(shape.mesh for shape in described if shape.mesh is not None)
-    # Load a mesh that several limbs share only once, because loading may take a tenth of a second.
+    # Several limbs can share a mesh.  Load it only once, because loading may take a tenth of a second.
     loaded: dict[object, Corrected] = {}
     for shape in described:
         try:
@@ -84,7 +84,7 @@ def _placed(
 ) -> list[pin.GeometryObject]:
     """Return the shapes at their joints; ``turned`` rotates meshes whose files state that the y axis is up.
 
-    Most URDFs need meshes that are not rotated, because ROS ignores the up axis in COLLADA files.
+    Most URDFs expect meshes that are not rotated, because ROS ignores the up axis in COLLADA files.
     """
     objects = []
     for shape, solid in zip(shapes, solids, strict=True):

@@ -32,7 +32,7 @@ class ContactFront:
     """The foremost point, along a given direction, of the links that move with a contact frame.
 
     If several points are foremost (a flat front), the point nearest to a line is used.  This line goes through the
-    origin of the frame, along the given direction.
+    origin of the frame along the direction.
 
     Attributes:
         link: Link with the foremost point.
@@ -91,8 +91,8 @@ def contact_front(
 ) -> ContactFront | None:
     """Return the front of the links that do not move relative to a contact frame; ``None`` without shapes.
 
-    These are the link of the frame, the links welded to it, and the links behind joints that do not move.  Their
-    shapes are the collision shapes, or the visual shapes of links without collision shapes.
+    These links are the link of the frame, the links welded to it, and the links behind joints that do not move.  The
+    function uses the collision shapes of a link, or its visual shapes if it has no collision shapes.
 
     Args:
         robot: The robot with its shapes.
@@ -126,7 +126,7 @@ def contact_front(
 
 @lru_cache(maxsize=64)
 def rigid_silhouettes(robot: Robot, joint: int, held: tuple[str, ...] = ()) -> tuple[Silhouette, ...]:
-    """Return the shapes of the links that do not move relative to the link of a joint, if the joints ``held`` do not.
+    """Return the shapes of the links that do not move relative to the link of a joint while ``held`` joints rest.
 
     Only the meshes of these links are read, and the result is cached on disk.
     """
@@ -135,7 +135,7 @@ def rigid_silhouettes(robot: Robot, joint: int, held: tuple[str, ...] = ()) -> t
     near = [shape for shape in described if group[_joint(robot, shape.link)] == group[joint]]
     if not near:
         return ()
-    # Whether meshes with y up are turned depends on the shapes of all links.
+    # The shapes of all links determine whether meshes with y up are turned.
     needed = described if any(shape.y_up for shape in near) else near
     key, make = geometry_key(robot, needed), partial(_silhouettes, robot, needed)
     stored = cached("silhouettes", key, tuple[Silhouette, ...], make)

@@ -16,7 +16,8 @@ from impact_posture.system.arrays import Array
 
 # Points of a foot up to this height (m) above its lowest point also touch the ground.
 _PATCH = 5e-4
-# A contact area narrower than this (m) is treated as a point: the patch of a ball of 10 cm radius is this wide.
+# A contact area narrower than this (m) is treated as a point.  The contact area of a ball of 10 cm radius is this
+# wide.
 _SOLE = 0.02
 # Cosine of the largest tilt of a sole at the default posture, 10°.
 _UPRIGHT = float(np.cos(np.radians(10.0)))
@@ -27,9 +28,9 @@ _PROPORTIONS = 180
 def support(robot: Robot, frame: str, *, flat: bool) -> Support:
     """Return a foot; the shapes that move with its frame determine its contact point or sole.
 
-    A sole is flat, below its frame, and upright at the default posture.  Its size is the largest rectangle around its
-    middle inside the convex hull of its lowest points.  Any other foot touches the ground at its lowest point, and is
-    a surface if ``flat``, else a point.
+    A sole is flat, below its frame, and upright at the default posture.  The size of a sole is the largest rectangle
+    around its middle inside the convex hull of its lowest points.  Any other foot touches the ground at its lowest
+    point.  It is a surface if ``flat`` is true, and a point otherwise.
     """
     foot = Support(frame=frame, kind="surface" if flat else "point")
     sole = _lowest(robot, frame, np.array([0.0, 0.0, 1.0]))
@@ -78,7 +79,8 @@ def _inner_rectangle(points: Array) -> Array:
     if edges is None or edges[1].min() <= 0:
         return np.zeros(2)
     angles = np.pi / 2 * np.arange(1, _PROPORTIONS) / _PROPORTIONS
-    # Rectangles with a corner at a point are also tried, so that a rectangular sole is exact.
+    # Also try the proportions of rectangles with a corner at a point, so that the result for a rectangular sole is
+    # exact.
     proportions = np.hstack([[np.cos(angles), np.sin(angles)], np.abs(points.T) + 1e-9])
     halves = proportions * (edges[1][:, None] / (np.abs(edges[0]) @ proportions)).min(axis=0)
     return np.asarray(halves[:, halves.prod(axis=0).argmax()])

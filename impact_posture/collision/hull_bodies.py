@@ -34,9 +34,9 @@ class Body(NamedTuple):
 def merged_bodies(shapes: Sequence[pin.GeometryObject], apart: NDArray[np.bool_]) -> list[Body]:
     """Merge shapes of a robot into bodies, so that fewer pairs of bodies must be checked for collisions.
 
-    Two bodies are merged if they have the same joint, must stay apart from the same shapes, and every point of their
-    common hull is within 1 cm of one of the bodies.  ``apart``, shape (n, n), tells whether two shapes must not
-    touch.
+    Two bodies are merged on three conditions: they have the same joint, they must stay apart from the same shapes,
+    and every point of their common hull is within 1 cm of one of the bodies.  ``apart``, shape (n, n), tells whether
+    two shapes must not touch.
     """
     corners = [
         hull_corners(shape_points(shape.geometry) @ shape.placement.rotation.T + shape.placement.translation)
@@ -61,7 +61,7 @@ def _fill(a: Body, b: Body) -> bool:
     points, part = np.vstack(parts), np.repeat(np.arange(len(parts)), [len(corners) for corners in parts])
     hull = SweptHull("", "", 0, points, 0.0)
     faces = hull.faces
-    # Check only large faces between different shapes.  Every other face lies in a shape, or is near its own corners.
+    # Check only large faces between different shapes.  All other faces lie in a shape, or are small.
     edges = np.linalg.norm(points[faces] - points[np.roll(faces, 1, axis=1)], axis=2).max(axis=1)
     open_faces = np.flatnonzero(np.any(part[faces] != part[faces[:, :1]], axis=1) & (edges > _FILL))
     solids = [SweptHull("", "", 0, _thinned(corners), 0.0) for corners in parts]
@@ -73,9 +73,9 @@ def _fill(a: Body, b: Body) -> bool:
 
 
 def _thinned(corners: Array) -> Array:
-    """Keep only the corners that are farthest along one of 200 directions, if there are more than 200 corners.
+    """Reduce more than 200 corners to the corners that are farthest along one of 200 directions.
 
-    At most 200 corners remain, so no corner has more than 199 edges.  Coal allows at most 255.
+    At most 200 corners remain, so no corner has more than 199 edges.  Coal allows at most 255 edges.
     """
     directions = shape_points(coal.Sphere(1.0))
     return corners[np.unique((corners @ directions.T).argmax(axis=0))] if len(corners) > len(directions) else corners

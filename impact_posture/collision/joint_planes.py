@@ -14,12 +14,13 @@ from impact_posture.config.cached_values import StoredArray
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 
-# Number of grid positions per joint, and largest number of joints between two bodies.
+# ``_TRIED`` is the number of grid positions per joint.  ``_MOST_JOINTS`` limits the number of joints between two
+# bodies.
 _TRIED, _MOST_JOINTS = 25, 3
 # Half of the largest range of a joint, rad (m), so that the step of the grid is at most half a radian.
 _MOST_HALF = 6.5
-# Largest number of planes of a pair of bodies.  Smallest fraction that must remain of the free positions, where the
-# shapes do not touch.
+# ``_MOST_PLANES`` is the largest number of planes of a pair of bodies.  At free positions, the shapes do not touch;
+# at least the fraction ``_LEFT`` of the free positions must remain.
 _MOST_PLANES, _LEFT = 12, 1 / 3
 # The cost of a plane is the number of removed free positions, plus this fraction of all free positions.
 _WORTH = 0.05

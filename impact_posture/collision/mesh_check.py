@@ -95,7 +95,7 @@ class MeshCheck:
         return self._data.oMi[self._joints[index]] * self._shapes[index].placement
 
     def _within(self, away: Array, exempt: Collection[int]) -> Array:
-        """Return a column: whether the ball around each shape reaches a body at the distance ``away``."""
+        """Return, as a column, whether the ball around each shape reaches a body at the distance ``away``."""
         allowed = np.array([joint not in exempt for joint in self._joints])
         return np.asarray((away <= self._reach) & allowed)[:, None]
 

@@ -22,17 +22,18 @@ from impact_posture.system.text_files import open_regular, read_bytes
 
 # Largest mesh file, bytes, because loading a binary STL takes about 20 times its size in memory.
 LARGEST_FILE = 100_000_000
-# Processor time to read a mesh: a basic time, s, and bytes per second above it.  The largest binary STL takes 16 s.
+# Longest processor time for reading a mesh: ``_SECONDS``, plus 1 s for each ``_BYTES_PER_SECOND`` bytes.  The largest
+# binary STL takes 16 s.
 _SECONDS, _BYTES_PER_SECOND = 5.0, 2_500_000
-# Least time, s, for a mesh of a robot with meshes that took too long.
+# Least time, s, for reading a mesh after other meshes of the robot took too long.
 _LEAST_SECONDS = 0.5
-# Largest number of vertices of a mesh file with fewer bytes.  A short file can repeat its parts a million times.
+# Largest number of vertices of a mesh file that has fewer bytes than vertices.  Such a file repeats its parts.
 _MOST_VERTICES = 200_000
-# Number of meshes in memory, enough for a robot.
+# Largest number of meshes in memory, which is enough for one robot.
 _MOST_MESHES = 100
 # Number of bytes at the start of a mesh file in which the up axis and the unit are searched.
 _HEAD = 10_000
-# The statement of the unit in each mesh format that can state a unit: in meters, or a name.
+# Pattern of the unit in each mesh format that can state a unit.  The unit is a number of meters, or a name.
 _UNIT_TAGS = {
     ".dae": rb"""<unit\b[^>]*?\bmeter\s*=\s*["']([^"']*)""",
     ".x3d": rb"""<unit\b(?=[^>]*\bcategory\s*=\s*["']length["'])[^>]*?\bconversionFactor\s*=\s*["']([^"']*)""",
@@ -72,7 +73,7 @@ def read_meshes(paths: Iterable[Path]) -> None:
         del _READ[stamp]
 
     def seconds(stamp: _Stamp) -> float:
-        # After each mesh that took too long, the next has half of its time, so that many meshes do not take minutes.
+        # Each mesh that took too long halves the time of the next mesh, so that many meshes do not take minutes.
         slow = sum(isinstance(_READ.get(other), CallTimedOut) for other in stamps)
         return max((_SECONDS + stamp[1] / _BYTES_PER_SECOND) * 0.5**slow, _LEAST_SECONDS)
 

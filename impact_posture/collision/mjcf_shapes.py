@@ -1,7 +1,7 @@
 """Shapes of bodies from a compiled MJCF.
 
-MuJoCo has read and scaled the meshes already.  In contacts, MuJoCo replaces a mesh by its convex hull, and so does
-this module.  Geoms that collide with nothing are only visual, and only pictures use them.
+MuJoCo has already read and scaled the meshes.  In contacts, MuJoCo and this module replace a mesh by its convex hull.
+Geoms that collide with nothing are visual, and only pictures use them.
 """
 
 from __future__ import annotations

@@ -33,8 +33,8 @@ class FittedShapes:
         pairs: Pairs of bodies that must not touch, as indices into ``bodies``, shape (k, 2).
         always_touching: Names of shapes that overlap by design (:func:`touching_by_design`), so they may touch.
         joint_planes: Bounds on joints for nested bodies (:func:`nested_pairs`), which ``pairs`` leaves out.
-        hulls_touching: Names of nested bodies without such bounds on joints.  Only :class:`MeshCheck` detects their
-            collisions.
+        hulls_touching: Names of nested bodies without ``joint_planes``.  Only :class:`MeshCheck` detects collisions
+            of these bodies.
         links: Links whose shapes are used.
         warnings: Warnings about shapes, one line each.
     """
@@ -85,7 +85,7 @@ class _Source:
     links: tuple[str, ...]
 
     def without_shapes(self, used: Collection[str]) -> tuple[str, ...]:
-        """Return :attr:`RobotShapes.without_shapes` if the shapes of the links ``used`` are used."""
+        """Return :attr:`RobotShapes.without_shapes` for the case that the shapes of the links ``used`` are used."""
         model, bare = self.robot.model, list[str]()
         frames = [frame for frame in model.frames if frame.type == pin.FrameType.BODY]
         covered = {0, *(int(frame.parentJoint) for frame in frames if frame.name in used)}
@@ -98,7 +98,7 @@ class _Source:
         return tuple(bare)
 
     def all_warnings(self, used: Collection[str], warnings: Iterable[str]) -> tuple[str, ...]:
-        """Return all warnings if the shapes of the links ``used`` are used and loading them gave ``warnings``."""
+        """Return all warnings, including the ``warnings`` that loading the shapes of the links ``used`` gave."""
         words, bare = [] if used else [NO_SHAPES], self.without_shapes(used)
         if used and bare:
             named = f"links without shapes: {listed(bare)}"
@@ -116,7 +116,7 @@ def shape_warnings(robot: Robot) -> tuple[str, ...]:
     """Return the warnings of :func:`load_shapes` without computing hulls, which takes longer.
 
     Raises:
-        UrdfError: As in :func:`load_shapes`.
+        UrdfError: The same errors as in :func:`load_shapes`.
     """
     source = _source(robot)
 

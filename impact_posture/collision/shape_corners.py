@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from impact_posture.collision.swept_hull import SweptHull, hull_corners
 from impact_posture.system.arrays import Array
 
-# Number of corners of the polygon around a circle.  The polygon is 0.5 % larger.
+# Number of corners of the polygon around a circle.  The polygon is 0.5 % larger than the circle.
 _SIDES = 32
-# Number of points around a ball.  Their convex hull is 2 % larger.
+# Number of points around a ball.  The convex hull of the points is 2 % larger than the ball.
 _BALL = 200
 
 Triangles = NDArray[np.int_]

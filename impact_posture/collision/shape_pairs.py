@@ -48,8 +48,8 @@ def pairs_of(apart: NDArray[np.bool_]) -> list[Pair]:
 def touching_by_design(robot: Robot, shapes: Sequence[pin.GeometryObject], pairs: list[Pair]) -> list[Pair]:
     """Return the pairs of shapes that overlap by design, for example the covers of a wrist.
 
-    These shapes touch at the default posture and at more than half of 1,000 random postures.  Parts of a telescope
-    slide in each other along one line, and need to touch only at a named posture.
+    These shapes touch at the default posture and at more than half of 1,000 random postures.  Parts of a telescope,
+    which slide in each other along one line, only need to touch at a named posture.
     """
     data, touch = robot.model.createData(), touch_of(shapes)
     jacobians = np.array(pin.computeJointJacobians(robot.model, data, robot.posture()))

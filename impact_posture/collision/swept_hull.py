@@ -19,7 +19,8 @@ from impact_posture.system.arrays import Array
 MOST_VERTICES = 40
 """Largest number of vertices of a hull, because every vertex adds a constraint to the optimization."""
 
-# Points with a smaller extent (m) in a direction are flat.  Also half the thickness of the hull of flat points.
+# Points are flat if their extent (m) in one direction is smaller than this.  The hull of flat points is twice as
+# thick.
 _THIN = 1e-4
 _REQUEST = coal.DistanceRequest(True)
 _REQUEST.gjk_tolerance = 1e-12
@@ -29,7 +30,7 @@ _TOLERANCE = 0.004
 # Largest number of candidates for corners; the sweep radius is computed from all points.
 _MOST_CANDIDATES = 4000
 _CHUNK = 20_000
-# For fewer points, computing their convex hull takes more time than it saves.
+# The convex hull of fewer points than this takes more time than it saves.
 _FEW = 50
 # Largest error (m) of distances that coal computes.
 _ROUNDING = 1e-9

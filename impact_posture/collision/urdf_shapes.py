@@ -134,7 +134,7 @@ class LinkShape:
 
 
 def largest_extent(robot: Robot) -> float:
-    """Return the extent (m) above which a shape is not in meters: 5 m, or ten times the robot if larger."""
+    """Return the extent (m) above which a shape is not in meters: 5 m, or ten times the robot if this is larger."""
     data = robot.model.createData()
     pin.forwardKinematics(robot.model, data, robot.posture())
     points = [data.oMi[i].act(np.array(robot.model.inertias[i].lever)) for i in range(1, robot.model.njoints)]

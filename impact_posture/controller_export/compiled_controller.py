@@ -26,9 +26,10 @@ from impact_posture.system.libraries import library_path, load_library
 from impact_posture.tsid.controller import Command, Report
 
 _FUNCTIONS = ("init", "reset", "tick", "last_report", "move_to", "lead_posture", "brace", "contact", "release")
-# Functions that controllers with a reference flow have, and that controllers of earlier versions lack.
+# C functions of controllers with a reference flow.  Controllers of earlier versions lack them.
 _OPTIONAL = ("brace_before", "lead")
-# Number of doubles in a target: 1 (whether it is set), 3 (position), 9 (rotation), 6 (velocity), 6 (acceleration).
+# Number of doubles in a target: 1 (whether the target is set), 3 (position), 9 (rotation), 6 (velocity), and 6
+# (acceleration).
 TARGET = 25
 
 
@@ -38,7 +39,7 @@ class CompiledController:
     Attributes:
         manifest: The content of ``<prefix>.json``.
         parameters: Parameter name → values, shape (size,).  The next :meth:`reset` reads these values.
-        targets: Task name → its target as stored in the memory of the C code, shape (25,).
+        targets: Task name → target of the task as stored in the memory of the C code, shape (25,).
     """
 
     def __init__(self, library: ctypes.CDLL, document: Mapping[str, Any], manifest: Manifest) -> None:
@@ -75,7 +76,7 @@ class CompiledController:
     @classmethod
     @checked
     def load(cls, path: str | Path, *, robot: Robot | None = None) -> CompiledController:
-        """Load an exported controller.  **This runs its code**, so load only exports that you trust.
+        """Load an exported controller.  **This runs the exported code**, so load only exports that you trust.
 
         If ``lib<prefix>.so`` is missing, the method builds it.  The library must contain the identity of the manifest
         in the folder.
@@ -243,7 +244,7 @@ class CompiledController:
     def lead(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> None:
         """Do the same as :meth:`lead_posture`, and set all other targets to their outputs in the same motion.
 
-        Errors are as in :meth:`lead_posture`.
+        The errors are the same as in :meth:`lead_posture`.
         """
         self._lead("lead", q, v, a)
 
@@ -268,7 +269,7 @@ class CompiledController:
         return int(self._report.flow_failures)
 
     def brace(self, t: float = -math.inf, *, t_impact: float | None = None) -> None:
-        """Switch the impact-robust term on, or start the reference flow, at the first tick from the time ``t`` on.
+        """Switch the impact-robust term on, or start the reference flow, at the first tick that is not before ``t``.
 
         Args:
             t: Time of the switch, s, measured like the times of ticks; by default, the time of the next tick.
@@ -276,8 +277,8 @@ class CompiledController:
                 before the impact.
 
         Raises:
-            InputError: This phase cannot follow the present phase, ``t`` is before the time of a waiting phase,
-                ``t_impact`` is not finite, or a controller without a flow gets ``t_impact``.
+            InputError: This phase cannot follow the present phase, ``t`` is before the time of a phase that has not
+                begun yet, ``t_impact`` is not finite, or a controller without a flow gets ``t_impact``.
         """
         if t_impact is None:
             self._enter("brace", t)

@@ -15,7 +15,7 @@ from impact_posture.codegen.manifest_reader import Loose, read_checked
 from impact_posture.system.libraries import build_parts, library_path
 
 SCHEMA = "impact-posture/controller/1"
-# Largest size that a manifest may state.  A larger size is a mistake, and would allocate too much memory.
+# Largest size of an array that a manifest may state.  A larger size is a mistake, and would allocate too much memory.
 _MOST = 100_000
 
 Size = Annotated[int, Field(ge=-1, le=_MOST)]
@@ -66,7 +66,8 @@ def read_controller(path: Path) -> tuple[dict[str, Any], Manifest, Path]:
 def build_controller(folder: Path, manifest: dict[str, Any], generated: Sequence[str] = ()) -> Path:
     """Build ``lib<prefix>.so`` in the folder of an exported controller.
 
-    ``generated`` are additional compiler flags for the long sources without loops that are generated from the model.
+    ``generated`` are additional compiler flags for the sources that are generated from the model.  These sources are
+    long and contain no loops.
 
     Raises:
         CompilerError: The compiler failed or is missing.

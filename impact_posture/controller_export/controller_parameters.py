@@ -15,7 +15,8 @@ from impact_posture.tsid.limits.acceleration_bounds import LimitLaw
 from impact_posture.tsid.tasks.frame_tasks import FrameTask
 
 Rule = Literal["finite", "nonnegative", "positive", "limit", "amount", "share"]
-# Bit mask of each rule in the C code: 1 for finite, 2 for not negative, 4 for not zero, 8 for at most one.
+# Bit mask of each rule in the C code.  A value must be finite (bit 1), not negative (2), not zero (4), at most one
+# (8).
 RULES: dict[Rule, int] = {"finite": 1, "nonnegative": 3, "positive": 6, "limit": 0, "amount": 7, "share": 14}
 
 

@@ -42,7 +42,7 @@ _RELAXATION = (
     "relaxation_memory.c", "vector.c", "relaxation_rows.c", "relaxation_elimination.c", "relaxation_level.c",
     "relaxation_cost.c", "relaxation.c",
 )  # fmt: skip
-# Parameters that ``init`` compares with other parameters, so their numbers are needed by name.
+# Parameters that ``init`` compares with other parameters.  The C code needs the index of each of them by name.
 _NAMED = ("control_upper", "joint_upper", "contact_normal", "law_rate", "posture_weight", "task_weight")
 # Stack bytes of a tick apart from arrays: variables, saved registers and return addresses of all functions.
 _FRAMES = 4096
@@ -57,7 +57,7 @@ class GeneratedCode:
         blocks: C functions that each compute a part of the quantities.
         angles: Indices of the entries of ``q`` whose sine and cosine are used.
         work: Length of the work array.
-        outputs: Assignments after the blocks, as pairs of target and value.
+        outputs: Assignments after the calls of the blocks, as pairs of target and value.
         constant_outputs: Assignments of values that do not depend on the state.
         stack_bytes: Upper bound on the stack usage, bytes.
     """
@@ -142,9 +142,9 @@ def render(
     """Return file name → text of the header and the sources, whose C names begin with ``prefix``.
 
     The library contains the ``identity`` of the manifest.  C names of the gradient begin with ``metric``; ``None``
-    means no gradient.  If ``objective`` is given, the files contain its :func:`objective_code`; otherwise, the caller
-    exports the gradient.  With ``shared``, the last parameter is ``numbers``; robots with the same code differ only
-    in these numbers.
+    means no gradient.  If ``objective`` is not ``None``, the files contain the result of :func:`objective_code`;
+    otherwise, the caller exports the gradient.  With ``shared``, the last parameter is ``numbers``, and robots with
+    the same code differ only in these numbers.
     """
     points, robot = tuple((p.frame, p.offset, p in s.turning) for p in s.points), s.robot
     code = dynamics_code(robot, points, shared=shared)

@@ -88,7 +88,7 @@ def structure_of(robot: Robot, formulation: TaskFormulation) -> Structure:
     actuators = Actuators(robot)
     strict = tuple(task for level in formulation.levels for task in level)
     tasks, contacts, points = (*strict, *formulation.weighted), formulation.contacts, formulation.points
-    # Copy the tasks, because an assembly takes over their targets, and a controller may be running with these tasks.
+    # Copy the tasks, because an assembly changes their targets, and a running controller may use the same tasks.
     copied = tuple(tuple(map(copy, level)) for level in formulation.levels)
     copies = replace(formulation, levels=copied, weighted=tuple(map(copy, formulation.weighted)))
     assembly = Assembly(robot, copies, actuators)
@@ -227,8 +227,8 @@ def _check(robot: Robot, formulation: TaskFormulation) -> None:
         if type(task) not in known:
             raise refuse(f"task '{task.name}' ({type(task).__name__}) has no C code")
     if isinstance(formulation.posture, ReferenceFlowPosture) and formulation.contacts and not robot.floating:
-        # A flow with contacts and a fixed base raises an error in Python, too, so the hint "run it in Python" would
-        # be wrong.
+        # The hint "run it in Python" would be wrong here, because Python also rejects a flow with contacts and a
+        # fixed base.
         what = f"'{formulation.posture.name}' with contacts needs a floating base"
         raise InputError(what, where="controller export", hint="leave out `contacts`")
     if formulation.row_limits:

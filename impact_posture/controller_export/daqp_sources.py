@@ -1,6 +1,6 @@
 """C sources of DAQP, the QP solver of an exported controller, in one version whose content is checked.
 
-The sources come from the source distribution on PyPI.  pip downloads it once, but neither builds nor runs it.
+pip downloads the source distribution from PyPI once, but neither builds nor runs the distribution.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from impact_posture.system.text_files import open_regular, read_bytes
 VERSION = "0.11.0"
 SOURCES = ("auxiliary.c", "daqp.c", "factorization.c")
 _HEADERS = ("auxiliary.h", "constants.h", "daqp.h", "factorization.h", "types.h")
-# SHA-256 of the source distribution, which pip checks, and of the files in FILES, joined in this order.
+# Two hashes: SHA-256 of the source distribution, which pip checks, and SHA-256 of all files in FILES, joined in
+# order.
 _ARCHIVE_SHA256 = "2f27baf18d2acca14186498e651b34e0bed455627e777d3fd8ba655e7e40f920"
 _CONTENT_SHA256 = "7cce7844f7cf515e8c1fe9208e3996b0569c954ef641ad5b3478657ee23a6e9d"
 # Path of each file in the distribution.  In an exported controller, all files are in one folder.
@@ -54,7 +55,7 @@ def daqp_sources(folder: Path | None = None) -> dict[str, bytes]:
             distribution in the cache is used; if it is missing, pip downloads it.
 
     Raises:
-        InputError: The sources are not available, or are not the sources of :data:`VERSION`.
+        InputError: The sources are not available, or belong to another version than :data:`VERSION`.
         OutputError: The cache cannot be written, or other users may write to it.
     """
     if folder is not None:

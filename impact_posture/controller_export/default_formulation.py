@@ -45,7 +45,8 @@ def default_formulation(
     Raises:
         InputError: The robot is not of this kind, or its data do not name an end effector.
     """
-    # The posture weight of a standing robot is small compared with the weights of center of mass and base (10 and 1).
+    # The posture weight of a standing robot is smaller than the weights of the center of mass (10) and of the base
+    # (1).
     kp, weight, base = (20.0, 0.1, 0.0) if kind == "legged" else (10.0, 1.0, None)
     if objective is None:
         posture = JointPosture(robot, kp=kp, weight=weight, base_weight=base)
@@ -65,7 +66,7 @@ def _end_effector(robot: Robot, objective: WorstCaseObjective | None) -> EndEffe
     """Return the task of the end effector, or ``None`` if no frame is known.
 
     The end effector is the frame of the impact.  Without an impact, or if the pose mode of this frame is ``free``,
-    the end effector is the default contact frame.  The pose mode of the frame determines the task
+    the end effector is the default contact frame.  The pose mode of the end effector determines the task
     (:func:`~impact_posture.tsid.tasks.frame_tasks.pose_task`).  ``aligned`` uses the normal at the default posture.
     """
     frame, offset = robot.spec.contact.frame, robot.spec.contact.offset

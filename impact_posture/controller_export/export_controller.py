@@ -100,10 +100,11 @@ def export_controller(
         build: Also build ``lib<prefix>.so`` in the folder, if there is a compiler.
         force: Replace an earlier export.
         generated: Additional compiler flags for the sources that are generated from the model.
-        shared: Make armature and joint placements a parameter, ``numbers``, so that robots that differ only in these
-            numbers share the code.  The code then contains the gradient.
-        path: Path whose references (:class:`~impact_posture.path.path_reference.PathReference`) the folder contains
-            as well, with an example.  If the path strikes, its contact must be the contact of ``objective``.
+        shared: Make armature and joint placements a parameter, ``numbers``.  Robots that differ only in these numbers
+            then share the code.  The code then contains the gradient.
+        path: The folder also contains the references along this path
+            (:class:`~impact_posture.path.path_reference.PathReference`) and an example.  If the path strikes, its
+            contact must be the contact of ``objective``.
 
     Raises:
         InputError: A task or joint has no C code, the gradient or the sources of DAQP are missing, or the path does

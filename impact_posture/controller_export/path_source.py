@@ -24,9 +24,9 @@ _TABLES = ("joint_family", "joint_q", "joint_v")
 
 
 def path_reference(robot: Robot, path: PosturePath, objective: WorstCaseObjective | None) -> PathReference:
-    """Return the references along a path in Python.  The contact is the contact of the objective.
+    """Return the references along a path in Python; the contact is the contact of the objective.
 
-    With an objective, the contact is also noticed when the contact point stops.
+    With an objective, the references also detect the contact when the contact point stops.
     """
     oracle = None if objective is None else objective.oracle.at(path.q[-1])
     rotors = robot.spec.propulsion
@@ -37,8 +37,8 @@ def render_path(s: Structure, reference: PathReference, prefix: str) -> dict[str
     """Return file name → text of ``<prefix>_path.h``, ``<prefix>_path.c`` and ``example.c``.
 
     Raises:
-        InputError: The path is for another robot, or is without motion, or the references of the controller come from
-            a reference flow.
+        InputError: The path is for another robot, the path contains no motion, or the references of the controller
+            come from a reference flow.
     """
     path, strike = reference.path, reference.path.strike
     fault = ""

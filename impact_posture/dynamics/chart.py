@@ -13,7 +13,7 @@ from impact_posture.dynamics.joints import JointKind, joint_kind
 from impact_posture.robot.model_joints import ENDLESS
 from impact_posture.system.arrays import Array
 
-# Joint families whose last chart coordinate is an angle; q contains the cosine and sine of this angle.
+# Joint families whose last chart coordinate is an angle.  ``q`` contains the cosine and sine of this angle.
 _ANGLES = ("continuous", "planar")
 # Joint families whose coordinates can have limits.
 BOUNDED = ("revolute", "prismatic", "translation")
@@ -40,8 +40,8 @@ class Chart:
 
     def __init__(self, model: pin.Model) -> None:
         self.slots: list[JointSlot] = []
-        # Pairs of an index in q and an index in x.  ``copied`` contains entries with equal values.  ``angles``
-        # contains the entry of a cosine in q, which the sine follows, and the entry of the angle in x.
+        # Both lists contain pairs of an index in q and an index in x.  The values of ``copied`` are equal in q and x.
+        # ``angles`` pairs the cosine of an angle in q with the angle in x; the sine follows the cosine.
         copied: list[tuple[int, int]] = []
         angles: list[tuple[int, int]] = []
         start = 0

@@ -13,7 +13,8 @@ from impact_posture.dynamics.spatial import Spin, constant, quaternion_matrix, s
 from impact_posture.errors import UnsupportedJoint
 from impact_posture.robot.model_joints import JOINT_ENTRIES, joint_family
 
-# Families that rotate by an angle about an axis; families whose configuration ends with a quaternion.
+# ``_TURNING`` are families that rotate by an angle about an axis.  The configuration of a ``_QUATERNION`` family ends
+# with a quaternion.
 _TURNING, _QUATERNION = ("revolute", "continuous", "planar"), ("free-flyer", "spherical")
 
 
@@ -60,7 +61,7 @@ def joint_kind(joint: pin.JointModel, name: str) -> JointKind:
 
 
 def joint_transform(kind: JointKind, q: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Return rotation (3, 3) and translation (3,), at ``q``, of the joint frame relative to its rest frame."""
+    """Return rotation (3, 3) and translation (3,) of the joint frame at ``q``, relative to its rest frame."""
     rotation, translation = ca.SX.eye(3), ca.SX(3, 1)
     if kind.family in _TURNING:
         rotation = axis_rotation(*_cosine_sine(kind, q), axis=tuple(kind.axis.tolist()))

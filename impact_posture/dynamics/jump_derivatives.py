@@ -55,14 +55,14 @@ class Foot:
 
 @dataclass(frozen=True, eq=False)
 class _Motion:
-    """Matrices with the columns ``U_j`` (``turned``) and ``A_j`` (``changed``) of all joints except root joints."""
+    """Columns ``U_j`` (in ``turned``) and ``A_j`` (in ``changed``) of all joints except root joints."""
 
     turned: ca.SX
     changed: ca.SX
 
 
 class JumpDerivatives:
-    """Derivatives of the jump equations at the configuration of ``tree``; ``tree`` must have no extra inertias."""
+    """Derivatives of the jump equations at the configuration of a tree.  The tree must have no extra inertias."""
 
     def __init__(self, tree: Kinematics, feet: Sequence[Foot]) -> None:
         self._tree, self._feet = tree, tuple(feet)
@@ -122,7 +122,7 @@ class JumpDerivatives:
         return below + above.T
 
     def _at_feet(self, motions: ca.SX, joints: Sequence[int]) -> ca.SX:
-        """Return foot velocities; in column k, links after ``joints[k]`` have the velocity ``motions[:, k]``."""
+        """Return foot velocities, one column per joint; links after ``joints[k]`` move with ``motions[:, k]``."""
         rows = [ca.SX(0, len(joints))]
         for foot, X in zip(self._feet, self._foot_motions, strict=True):
             rows.append(_kept(X @ motions, np.tile(self._lies_on([foot.point.joint], joints), (foot.rows, 1))))

@@ -29,7 +29,7 @@ Geom = Literal["sphere", "box", "plane"]
 WORLD = 0
 # Smallest mass (kg) and moment of inertia (kg m²) of a moving body that MuJoCo accepts.
 _LEAST = 1e-15
-# Impedance (solimp) of couplings: the largest that MuJoCo accepts.
+# Impedance (``solimp`` of MuJoCo) of couplings, with the largest values that MuJoCo accepts.
 _STIFF = (0.9999, 0.9999, 1e-4, 0.5, 2.0)
 # With these options MuJoCo does not change inertias and does not merge bodies.
 _COMPILER = {
@@ -53,7 +53,7 @@ class Mjcf:
         layout: Conversions between the coordinates of Pinocchio and MuJoCo.
         bodies: Index of a Pinocchio joint → name of the body that the joint moves.
         joints: Index of a Pinocchio joint → names of the MuJoCo joints that represent it.
-        sites: Index of a frame → name of its site.  If several frames have the same name, only one has a site.
+        sites: Index of a frame → name of its site.  Of several frames with the same name, only one has a site.
         moments: Body name → principal moments of inertia that MuJoCo rejects, kg·m², shape (3,).  The spec contains
             the nearest accepted moments, and :meth:`compile` sets the exact moments.
     """
@@ -91,7 +91,7 @@ class Mjcf:
         )
 
     def couple_joints(self, robot: Robot) -> None:
-        """Let the followers of a robot follow their leaders, as stiffly as MuJoCo can with the present time step."""
+        """Couple followers to their leaders, as stiffly as MuJoCo can with the present time step."""
         types = import_mujoco()
         joint, kind = types.mjtObj.mjOBJ_JOINT, types.mjtEq.mjEQ_JOINT
         for c in robot.couplings:
@@ -170,7 +170,7 @@ def _depth_first(model: pin.Model) -> list[int]:
 
 
 def _is_free(model: pin.Model, slot: JointSlot) -> bool:
-    """Return whether a joint is a free-flyer on the world with equal armatures, so that a MuJoCo free joint fits."""
+    """Return whether a MuJoCo free joint can represent a joint: a free-flyer on the world with equal armatures."""
     if slot.kind.family != "free-flyer" or model.parents[slot.index] != 0:
         return False
     return bool(np.ptp(np.asarray(model.armature)[slot.v]) == 0)

@@ -33,8 +33,8 @@ class MjcfSlot:
         qpos: Entries of the joint in ``qpos``.
         qvel: Entries of the joint in ``qvel``.
         placement: Placement of the rest frame of the joint in its parent.
-        moved: Whether the joint is a MuJoCo free joint whose rest frame is not the world frame.  MuJoCo gives the
-            pose and linear velocity of a free joint in the world, but positions of slides in the rest frame.
+        moved: Whether the joint is a MuJoCo free joint whose rest frame is not the world frame.  In MuJoCo, pose and
+            linear velocity of a free joint are in the world.  Positions of slides are in the rest frame.
     """
 
     joint: JointSlot
@@ -57,7 +57,7 @@ class MjcfLayout:
         self.nqpos, self.nv, self.nq = chart.nx, chart.nv, chart.nq
         self.slots: list[MjcfSlot] = []
         # For each entry of qpos, ``places`` has the index of the chart coordinate with the same value.  For each
-        # entry of qvel, ``rates`` has its index in v.
+        # entry of qvel, ``rates`` has the index of the same entry in v.
         places: list[int] = []
         rates: list[int] = []
         for i in order:
@@ -82,8 +82,8 @@ class MjcfLayout:
     def places(self) -> tuple[NDArray[np.int_], NDArray[np.int_]] | None:
         """Index in ``qpos`` of each entry of ``q``, and index in ``qvel`` of each entry of ``v``.
 
-        For a floating base, the quaternion must also be normalized, and the linear velocity rotated.  The value is
-        ``None`` for a model with joints that are not hinges or slides.
+        For a floating base, the caller must also normalize the quaternion and rotate the linear velocity.  The value
+        is ``None`` for a model with joints that are not hinges or slides.
         """
         base = len(self._turning)
         # If no joint has a cosine and a sine in q, the chart coordinates equal q.

@@ -21,8 +21,8 @@ from impact_posture.system.optional_package import import_mujoco
 class MujocoNumeric:
     """Compute dynamics of a robot with MuJoCo at one configuration.
 
-    The model is the MJCF from which the robot was loaded.  For a robot from a URDF, a robot with a ``mounting`` in
-    its settings, and ``frames`` of joints, the model is the result of :func:`build_mjcf`.
+    The model is the MJCF from which the robot was loaded.  In three cases, the model is the result of
+    :func:`build_mjcf`: for a robot from a URDF, with a ``mounting`` in the settings, and if ``frames`` are joints.
 
     The method :meth:`at` sets the configuration and must be called first.  All vectors and matrices are in the order
     and tangent space of Pinocchio.  Joints with an infinite armature get an armature of zero.

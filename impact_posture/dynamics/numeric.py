@@ -67,9 +67,9 @@ class Numeric:
     def coupling_gradient(self, point: PointOnLink, wrench: Array, v: Array, *, in_frame: bool = False) -> Array:
         """Return the tangent gradient of ``wᵀ J(q) v``, shape (nv,).
 
-        ``w`` is constant in the frame of the point if ``in_frame``, else in the world.  The LOCAL_WORLD_ALIGNED
-        derivatives of Pinocchio omit the rotation of the frame.  Therefore the LOCAL derivatives are used and rotated
-        to world axes.
+        With ``in_frame``, ``w`` is constant in the frame of the point; otherwise, in the world.  The
+        LOCAL_WORLD_ALIGNED derivatives of Pinocchio omit the rotation of the frame.  Therefore the LOCAL derivatives
+        are used and rotated to world axes.
         """
         pin.computeForwardKinematicsDerivatives(self.model, self.data, self.q, v, self._zero)
         frame = self.model, self.data, point.joint, point.placement, pin.LOCAL

@@ -18,8 +18,8 @@ from impact_posture.dynamics.joints import joint_kind
 from impact_posture.dynamics.spatial import constant, rounded
 from impact_posture.robot.model_joints import finite_armature
 
-# A constant that is zero in only one of two limbs costs operations in both limbs.  Limbs are repeated only if the
-# number of nonzero constants increases by at most this factor.
+# A constant that is zero in only one of two limbs costs operations in both limbs.  Limbs are treated as repeated only
+# if the number of nonzero constants increases by at most this factor.
 _FILL = 1.25
 # Numbers of SIMD lanes, in order of preference.
 _WIDTHS = (4, 2)
@@ -50,7 +50,7 @@ class RepeatedLimbs:
     """
 
     def __init__(self, model: pin.Model, coupled: Collection[str] = ()) -> None:
-        # A coupling distinguishes the limbs with the joints ``coupled`` from the other limbs of their group.
+        # Limbs with one of the joints ``coupled`` differ from the other limbs of their group.
         groups = _groups(model)
         self.groups = tuple(g for g in groups if not any(model.names[k] in coupled for limb in g for k in limb))
         self.places = {

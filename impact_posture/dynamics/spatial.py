@@ -105,8 +105,8 @@ def motion_cross_force(motion: ca.SX, force: ca.SX) -> ca.SX:
 class Spin:
     """Rotation about a coordinate axis, given by the cosine and sine of the angle.
 
-    ``axis`` is 0, 1 or 2.  ``sense`` is −1 if the joint axis points opposite to the coordinate axis, else 1; ``sine``
-    already includes this sign.
+    ``axis`` is 0, 1 or 2.  ``sense`` is −1 if the joint axis points opposite to the coordinate axis, and 1 otherwise.
+    ``sine`` already includes this sign.
     """
 
     axis: int

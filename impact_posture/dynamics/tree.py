@@ -1,6 +1,6 @@
-"""Dynamics of a robot at a symbolic configuration, by an articulated-body factorization in O(n).
+"""Dynamics of a robot at a symbolic configuration, by the articulated-body algorithm in O(n).
 
-All quantities are in link coordinates.  ``M`` does not depend on the pose of the base, which only rotates world
+All quantities are in link coordinates.  ``M`` does not depend on the pose of the base.  This pose only rotates world
 directions to link coordinates.  Notation and signs follow Featherstone, *Rigid Body Dynamics Algorithms*
 (2008), but the linear part is first, as in Pinocchio.
 """
@@ -45,7 +45,7 @@ class Wrench:
 
     Attributes:
         point: The point, with the axes of its frame.
-        force: The force, shape (3,), in the axes of the frame if ``in_frame``, else in world axes.
+        force: The force, shape (3,), in the axes of the frame if ``in_frame`` is true, otherwise in world axes.
         moment: The moment about the point, shape (3,), in the same axes as the force.
         in_frame: Whether the wrench is constant in the frame and turns with the link, or is constant in the world.
     """
@@ -93,10 +93,10 @@ class Response:
 
 
 class Tree(Kinematics):
-    """Dynamics of a model; most arguments are as for :class:`~impact_posture.dynamics.kinematics.Kinematics`.
+    """Dynamics of a model; most arguments are arguments of :class:`~impact_posture.dynamics.kinematics.Kinematics`.
 
-    ``couplings`` are (entry of the follower in ν, entry of the leader, ratio) of coupled joints with one axis, which
-    :meth:`respond` considers.
+    ``couplings`` are (entry of the follower in ν, entry of the leader, ratio) of coupled joints with one axis.  Only
+    :meth:`respond` considers the couplings.
     """
 
     def __init__(
@@ -151,8 +151,8 @@ class Tree(Kinematics):
     ) -> ca.SX:
         """Return ``M(q) v − Σ Jᵀ w`` in O(n), shape (nv,), where ``w`` are the wrenches ``less``.
 
-        ``M`` includes the armature, and the extra inertias if ``extra``.  ``velocities`` may pass the result of
-        :meth:`velocities` for ``v``.
+        ``M`` includes the armature and, if ``extra`` is true, the extra inertias.  ``velocities`` may be the result
+        of :meth:`velocities` for ``v``, which saves time.
         """
         velocities = self.velocities(v) if velocities is None else velocities
         inertia = self._inertia if extra else self._own_inertia
@@ -210,7 +210,7 @@ class Tree(Kinematics):
 
     @cached_property
     def _factor(self) -> dict[_Cluster, tuple[ca.SX, ...]]:
-        """For every cluster ``(pivot, I^A, D⁻¹Uᵀ, I^A − U D⁻¹Uᵀ)`` with ``U = I^A S``, ``D = SᵀU + armature``.
+        """Return cluster → ``(pivot, I^A, D⁻¹Uᵀ, I^A − U D⁻¹Uᵀ)`` with ``U = I^A S`` and ``D = SᵀU + armature``.
 
         ``I^A`` is the articulated inertia of the link (Featherstone 2008, chapter 7), block diagonal for several
         links.  The pivot is ``1/D`` for one rate, ``D`` for a joint with several axes, and zero for a locked joint
@@ -221,7 +221,7 @@ class Tree(Kinematics):
         for c in reversed(self._clusters):
             inertia = ca.diagcat(*[articulated[i] for i in c.joints])
             D = step.pivot(inertia, c.S, (c.shares * c.shares).T @ self.armature[c.entries])
-            # Computed outside the templates, so that a constant D gives a constant factor 1/D instead of a division.
+            # The pivot is computed outside the templates, so that a constant D gives a constant factor 1/D.
             pivot = ca.SX(0) if c.entries[0] in self.locked else 1 / D if D.is_scalar() else D
             factors[c] = pivot, inertia, *step.reduce(inertia, c.S, pivot)
             if c.parent:
@@ -235,11 +235,11 @@ class Tree(Kinematics):
         return factors
 
     def respond(self, tau: ca.SX | None = None, wrenches: Sequence[Wrench] = ()) -> Response:
-        """Solve ``M a = τ + Σ Jᵀ w`` by the articulated-body factorization in O(n), without computing ``M``.
+        """Solve ``M a = τ + Σ Jᵀ w`` by the articulated-body algorithm in O(n), without computing ``M``.
 
         The same sweeps give the force through joint i, ``f_i = I^A_i v_i + p^A_i``.  Couplings between joints at
-        different links add a torque ``Kᵀμ`` such that ``K a = 0``, where each row of K is 1 at a follower and minus
-        the ratio at its leader.
+        different links add a torque ``Kᵀμ`` such that ``K a = 0``.  Each row of K is 1 at a follower, and minus the
+        ratio at the leader of this follower.
         """
         if not self._coupling_responses:
             return self._free_response(tau, wrenches)
@@ -308,7 +308,7 @@ class Tree(Kinematics):
         forces = [dict(x.forces), dict(y.forces)]
         for c, (*_, inertia) in self._factor.items():
             spin = self._spin[i := c.joints[0]]
-            # The force on one of several links also depends on the motion of the others.
+            # In a cluster of several links, the force on one link also depends on the motion of the other links.
             if spin is not None and len(c.joints) == 1:
                 rows[i] = spin_power(inertia, x.before[i], y.before[i], axis=spin.axis, sense=spin.sense)
                 forces[0][i], forces[1][i] = x.passed[i], y.passed[i]

@@ -20,7 +20,7 @@ def pivot(inertia: ca.SX, S: ca.SX, armature: ca.SX) -> ca.SX:
 
 @template
 def reduce(inertia: ca.SX, S: ca.SX, pivot: ca.SX) -> tuple[ca.SX, ...]:
-    """Return the gain ``D⁻¹SᵀI``, shape (nv, 6), and the inertia passed to the parent, ``I − I S D⁻¹SᵀI``."""
+    """Return ``gain``, the matrix ``D⁻¹SᵀI``, shape (nv, 6), and the inertia ``I − I S D⁻¹SᵀI`` for the parent."""
     U = inertia @ S
     gain = solve(pivot, U.T)
     return gain, symmetric(inertia - U @ gain)
