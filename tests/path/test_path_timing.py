@@ -269,6 +269,18 @@ def test_a_floating_base_without_rotors_or_feet_has_no_limits() -> None:
     assert limits.missing == "there are neither rotors nor feet that could hold the robot up"
 
 
+def test_the_largest_rate_of_an_arm_brings_one_torque_to_its_limit() -> None:
+    loaded, draw = robot("ur5"), rng("largest rate")
+    limits = ActuatorLimits(WorstCaseObjective(loaded, ImpactContact(loaded.spec.contact.frame, (0, 0, 1))),
+                            loaded.posture(), Requirements())  # fmt: skip
+    q, effort = loaded.posture(), loaded.model.effortLimit
+    rest, push = limits.load(q, np.zeros(6), np.zeros(6)), draw.normal(size=6)
+    rate = limits.largest_rate(q, rest, push)
+    assert rate is not None and np.max(np.abs(rest + rate * push) / effort) == pytest.approx(1, rel=1e-12)
+    assert limits.largest_rate(q, rest, np.zeros(6)) == np.inf
+    assert limits.largest_rate(q, 1.01 * effort, push) is None
+
+
 @pytest.mark.parametrize("name", ["solo8", "go2", "anymal_c"])
 def test_a_light_standing_robot_rests_and_a_slippery_one_does_not(name: str) -> None:
     """On level ground, a symmetric stance needs no friction at rest, but a lateral push requires friction."""

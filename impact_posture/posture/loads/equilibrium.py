@@ -195,14 +195,14 @@ class Equilibrium:
         The result is infinite if the actuators can hold the load for every λ, and ``None`` if they cannot even hold
         ``rest``.
         """
-        A, b, S, c = self._affine(rest, self._by_force(q))
         rate = self.rows @ dynamic
-        of_shares = np.append(rate[self.balanced :], np.zeros(len(self._free)))
         if not self.load.count and not self.balanced:
             # A linear program is not needed, because no forces are unknown.
-            moving = of_shares != 0
-            most = ((1 - np.sign(of_shares) * c)[moving] / np.abs(of_shares[moving])).min(initial=np.inf)
-            return None if np.abs(c).max(initial=0.0) > 1 else float(most)
+            shares, moving = self.rows @ rest + self.offset, rate != 0
+            most = ((1 - np.sign(rate) * shares)[moving] / np.abs(rate[moving])).min(initial=np.inf)
+            return None if np.abs(shares).max(initial=0.0) > 1 else float(most)
+        A, b, S, c = self._affine(rest, self._by_force(q))
+        of_shares = np.append(rate[self.balanced :], np.zeros(len(self._free)))
         optimum = solve_linear(
             np.append(np.zeros(self.load.count), -1.0),
             np.vstack([np.column_stack([A, rate[: self.balanced]]), np.column_stack([S, of_shares])]),
