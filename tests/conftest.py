@@ -48,6 +48,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--hostile-full", action="store_true", help="attack at length: minutes instead of seconds")
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Run the tests first that fork most often, because a fork takes the longer, the more memory a process uses."""
+    items.sort(key=lambda item: item.path.parent.name not in ("hostile", "cli", "docs", "experiment"))
+
+
 def pytest_collection_finish() -> None:
     """Freeze all imported objects, so that the garbage collector only examines objects that tests create."""
     gc.collect()
