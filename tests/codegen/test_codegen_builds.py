@@ -28,8 +28,6 @@ from impact_posture.system.toolchain import run_compiler
 from tests.support import command, exported
 from tests.support.tools import STRICT, need, need_compiler
 
-OPTIMIZED = True
-
 JOINTS = [
     ("revolute", "1 0 0"), ("revolute", "0.6 0 0.8"), ("prismatic", "0 1 0"), ("prismatic", "0 -0.6 0.8"),
     ("continuous", "0 0 1"), ("continuous", "0.6 0.8 0"), ("planar", "0 0 1"), ("floating", "0 0 1"),
