@@ -37,7 +37,7 @@ from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_spec import Support
 from impact_posture.system.arrays import Array
 
-# Only functions that use the C export import it, because the import takes longer than solving a small problem.
+# The C export is imported inside functions, because the import takes longer than solving a small problem.
 if TYPE_CHECKING:
     from impact_posture.codegen.export import Export
 
@@ -54,9 +54,9 @@ class ImpactObjective(WorstCaseObjective):
             :class:`~impact_posture.impact.metric.Metric`.
         kind: Minimized quantity: ``impulse`` (λ̄²H), ``speed`` (V), ``sticking`` (S), ``coulomb`` (C), ``energy`` (E)
             or ``effective-mass`` (m).  λ̄ is the largest impulse of the contact, and ``docs/notation.md`` defines the
-            other symbols.  ``None`` selects ``impulse``.  But if the contact states its friction, ``None`` selects
-            the same quantity as ``--objective auto`` on the command line.  In a :class:`PostureProblem` that states
-            the speed or the elasticity of the contact, ``None`` does the same.
+            other symbols.  ``None`` selects ``impulse``.  If the contact states its friction, ``None`` instead
+            selects the quantity that ``--objective auto`` selects on the command line.  The same holds in a
+            :class:`PostureProblem` that states the speed or the elasticity of the contact.
         supports: Feet that stay in place during the impact, as ``FRAME[:point|surface]``; ``None`` selects the feet
             of robot.toml, ``()`` selects no feet.
         compliance: Compliance ε of the supports, 1/kg; 0 selects 1e-4 divided by the mass of the robot.
@@ -68,7 +68,7 @@ class ImpactObjective(WorstCaseObjective):
         weights: Weights of the weighted metric: nv numbers, a TOML file, or ``velocity-limits``.
         armature_range: Lowest and highest factor on the armature.  If ``model_variants`` is empty, variants are built
             from this range and from ``payloads``.
-        payloads: Payloads that the robot may carry, one at a time: frame and mass in kg.
+        payloads: Payloads as pairs of frame and mass, kg.  The robot carries at most one payload at a time.
         contact_point: ``front`` moves each contact point to the foremost point, along −n, of the links that move with
             the contact frame.
         posture: Posture at which ``front`` determines the contact point: a name, a file or a configuration; ``None``
@@ -127,7 +127,7 @@ class ImpactObjective(WorstCaseObjective):
         super().__init__(
             robot, leading, metric, chosen, feet, compliance, normal_cone_deg, tuple(more), bilateral, variants
         )
-        # PostureProblem chooses again, because it may state the speed.
+        # PostureProblem chooses the kind again, because the problem may state the speed.
         object.__setattr__(self, "_stated_kind", kind)
         # A missing support is not an error, because an impact can be evaluated without supports.
         object.__setattr__(self, "_missing", missing_support(robot) if supports is None and not feet else "")

@@ -35,7 +35,7 @@ from impact_posture.robot.posture_files import write_posture
 from impact_posture.system.arrays import Array
 from impact_posture.system.output_folder import whole_folder, write_json
 
-# Only functions that use these modules import them, because the imports take longer than solving a small problem.
+# These modules are imported inside functions, because the imports take longer than solving a small problem.
 if TYPE_CHECKING:
     from impact_posture.codegen.export import Export
     from impact_posture.path.posture_path import PosturePath
@@ -244,7 +244,7 @@ class PostureResult:
         self, out: str | Path, formats: Sequence[str] = DEFAULT_FORMATS, only: Sequence[str] | None = None, *,
         force: bool = False,
     ) -> list[Path]:  # fmt: skip
-        """Draw the figures into a folder, and return their paths.  With ``force``, replace files of the user too.
+        """Draw the figures into a folder, and return their paths.  ``force`` permits to replace the user's files.
 
         Raises:
             OutputError: A file of the user has the name of a figure, or the folder cannot be written.
@@ -280,8 +280,8 @@ def optimize(
     Args:
         problem: The problem.
         starts: Largest number of random postures that the search screens, by default 6144.  If the search is
-            ``multistart``, or the problem cannot be screened, it is the number of starts, by default 16.  The first
-            start is then the given posture, and the others are random feasible postures.
+            ``multistart``, or the problem cannot be screened, ``starts`` is the number of starts, by default 16.  The
+            first start is then the given posture, and the others are random feasible postures.
         seed: Seed of the random starts.
         jobs: Number of parallel processes.
         compile: When to compile the program: ``auto`` (if it saves time), ``always`` or ``never``.

@@ -20,7 +20,7 @@ from impact_posture.system.text_files import read_text
 
 _Value = TypeVar("_Value", bound=Hashable)
 
-# Largest cache file that is read, bytes: three times the largest file for the robots of this package.
+# Larger cache files are not read, bytes.  The largest file for a robot of this package has a third of this size.
 _LONGEST = 10_000_000
 
 # For each running ``make``, whether its value may be stored.
@@ -44,7 +44,7 @@ def cached(kind: str, key: str, cls: type[_Value], make: Callable[[], _Value]) -
     """Return the value of the file ``<kind>/<key>.json`` in the cache; without a valid file, make and store it.
 
     ``cls`` is the type of the value: a dataclass, or a tuple of dataclasses.  ``make`` computes the value.  If the
-    cache cannot be written, the value is only returned.
+    cache cannot be written, the value is returned without being stored.
     """
     with suppress(OSError, OutputError, TypeError, ValueError):
         path = cache_folder(kind) / f"{key}.json"
@@ -66,5 +66,5 @@ def cached(kind: str, key: str, cls: type[_Value], make: Callable[[], _Value]) -
 
 
 def do_not_store() -> None:
-    """Keep the values that are being made out of the cache, because another attempt may give other values."""
+    """Do not store the values that are being computed, because another attempt may give other values."""
     _STORABLE[:] = [False] * len(_STORABLE)

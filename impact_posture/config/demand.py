@@ -15,9 +15,10 @@ from impact_posture.config.text_parsers import parse_contact
 from impact_posture.errors import ImpactPostureError, not_one_of
 
 _INFINITE = float("inf")
-# Largest length (m) and largest mass (kg).  With a greater length, the solver does not return.  With a greater mass,
-# the mass matrix is singular in double precision.
-_FARTHEST, _HEAVIEST = 1e100, 1e12
+# Largest length, m.  With a greater length, the solver does not return.
+_FARTHEST = 1e100
+# Largest mass, kg.  With a greater mass, the mass matrix is singular in double precision.
+_HEAVIEST = 1e12
 # Smallest tilt, degrees.  The cosine of a smaller tilt is not accurate enough for the tolerance of the certificate.
 _LEAST_TILT = 0.1
 

@@ -60,24 +60,32 @@ TransmissionKind = Literal["rigid", "elastic", "locked"]
 # Gere lists 0.0007 to 0.004 GPa.
 MATERIALS = {"steel": (200e9, 0.28), "wood": (11.5e9, 0.3), "rubber": (0.03e9, 0.48), "ground": (24e9, 0.15)}
 
-# Default least distance (m) between links that must not touch.  Default edge length (m) of a square surface, which
-# replaces the endless plane if a foot or a fixed base is behind this plane.
-CLEARANCE, PATCH = 0.001, 0.3
-# Default half extents (m) of the boxes in which the contact frame and the base stay.
-BOX, BASE_BOX = (0.05, 0.05, 0.05), (0.2, 0.2, 0.2)
+# Default least distance between links that must not touch, m.
+CLEARANCE = 0.001
+# Default edge length of a square surface, m.  The square replaces the endless plane if a foot or a fixed base is
+# behind this plane.
+PATCH = 0.3
+# Default half extents of the box in which the contact frame stays, m.
+BOX = (0.05, 0.05, 0.05)
+# Default half extents of the box in which the base stays, m.
+BASE_BOX = (0.2, 0.2, 0.2)
 # Default friction coefficient (Coulomb), also of the contacts of the online controller.
 FRICTION = Unstated(0.7)
-# Default number of starts of a multi-start search, and of random postures that the adaptive search screens at most.
-STARTS, SCREENED = 16, 6144
+# Default number of starts of a multi-start search.
+STARTS = 16
+# Default for the largest number of random postures that the adaptive search screens.
+SCREENED = 6144
 # Default number of processes of a search, and of the runs of an experiment.
 JOBS = 2
 # Number of bounds if --tradeoff is given without a number.
 TRADEOFF_POINTS = 16
-# Largest number of simultaneous contacts.  The impulses of six contacts have 63 corners.  Each additional contact
-# doubles the number of inequalities in the program.
+# Largest number of simultaneous contacts.  The box of the impulses of six contacts has 63 corners.  Each additional
+# contact doubles the number of inequalities in the program.
 MOST_CONTACTS = 6
-# Default approach speed (m/s), and default coefficient of restitution, of predicted impacts.
-SPEED, RESTITUTION = Unstated(1.0), 0.0
+# Default approach speed of predicted impacts, m/s.
+SPEED = Unstated(1.0)
+# Default coefficient of restitution of predicted impacts.
+RESTITUTION = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)

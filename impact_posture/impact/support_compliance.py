@@ -11,8 +11,10 @@ from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_spec import Support
 from impact_posture.system.arrays import Array
 
-# Compliance times the mass of the robot: default, and least value for which rounding errors remain acceptable.
-_DEFAULT_COMPLIANCE, _LEAST_COMPLIANCE = 1e-4, 1e-6
+# Default compliance times the mass of the robot.
+_DEFAULT_COMPLIANCE = 1e-4
+# Least compliance times the mass of the robot, for which rounding errors remain acceptable.
+_LEAST_COMPLIANCE = 1e-6
 
 
 def default_compliance(robot: Robot) -> float:

@@ -165,7 +165,7 @@ def result_view(prepared: Prepared, postures: SolvedPostures, motion: PosturePat
 def _collisions(prepared: Prepared, *postures: Array) -> Any:
     """Return the colliding shapes at each posture, without shapes that held joints fix to each other.
 
-    With surroundings, the optimization excludes collisions.
+    If collisions are constrained, there are none, and the result is empty.
     """
     problem = prepared.problem
     if problem.surroundings is not None:

@@ -38,7 +38,7 @@ class ActuatorLimits:
     def __init__(self, objective: Objective, q: Array, requirements: Requirements) -> None:
         robot = objective.robot
         self._model, self._velocities = robot.model.copy(), robot.tangent_names
-        # Motor rotors turn with their joints during a motion, so the armature counts in every joint model.
+        # During a motion, the rotors of motors turn with the joints, so the armature counts for every joint model.
         self._model.armature = np.where(np.isfinite(robot.armature), robot.armature, 0.0)
         self._data = self._model.createData()
         self.rotors = bool(robot.floating and robot.spec.propulsion)

@@ -28,8 +28,10 @@ from impact_posture.posture.program.constrained_problem import ConstrainedProble
 from impact_posture.robot.support_polygon import polygon_edges
 from impact_posture.system.arrays import Array
 
-# The similar states: coefficients of restitution, and factors on the velocity before the impact.
-RESTITUTIONS, FACTORS = (0.0, 0.5), (0.8, 1.0, 1.2)
+# Coefficients of restitution of the similar impacts.
+RESTITUTIONS = (0.0, 0.5)
+# Factors on the velocity before the similar impacts.
+FACTORS = (0.8, 1.0, 1.2)
 # Number of normals on the edge of the cone.
 _EDGE = 4
 # Number of postures of a stop at which its distances are measured.
@@ -159,7 +161,7 @@ class _Stop:
 def _stop(impact: str, spaces: StrikeSpaces, q: Array, velocity: Array, limits: ActuatorLimits) -> _Stop | str:
     """Return the shortest stop from a velocity, or why none exists.
 
-    The curve keeps the rebound: the normal velocity of the contact point divided by the length of the curve.
+    Per length of the curve, the normal velocity of the contact point is constant, so the contact point rebounds.
     """
     space = spaces.rebound
     held = equality_jacobian(space.problem, Numeric(space.model).at(q))

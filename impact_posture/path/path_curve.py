@@ -30,8 +30,10 @@ _FINER = 8
 _STEP = 1e-5
 # A knot is a corner if the second derivative of the spline there exceeds this multiple of the median over the knots.
 _SHARP = 5.0
-# Number of parts between two knots for the check of limits: next to corners, and elsewhere.
-_AT_CORNERS, _BETWEEN = 8, 2
+# Number of parts between two knots for the check of limits, next to corners.
+_AT_CORNERS = 8
+# Number of these parts elsewhere.
+_BETWEEN = 2
 
 
 class PathCurve:

@@ -41,7 +41,7 @@ class PathReference:
 
     Then the references follow the stop after the impact, from their posture at the contact, or from the measured
     posture after the third event.  If the contact is early, the references have only a share of the planned velocity,
-    and the stop is as much smaller.  Exported controllers in C contain the same references
+    and the motion of the stop is scaled by the same share.  Exported controllers in C contain the same references
     (:mod:`impact_posture.controller_export.path_source`).
 
     Attributes:
@@ -70,12 +70,13 @@ class PathReference:
         self.reset()
 
     def reset(self) -> None:
-        """Return to the begin of the path, and wait there."""
+        """Return to the beginning of the path, and wait there."""
         self.phase, self.moment = PathPhase.IDLE, (self.path.q[0], self._rest, self._rest)
         # Motion to the beginning of the run-up, its first and last time, and the time when it begins.
         self._way: RowInterpolation = self.path
         self._until, self._begin, self._now = self._run_up, np.inf, -np.inf
-        # Times of the expected and of the noticed contact; posture, and share of the planned velocity, at the latter.
+        # Time of the expected contact, time of the noticed contact, posture at the noticed contact, and share of the
+        # planned velocity there.
         self._expected, self._hit, self._contact, self._share = np.inf, np.inf, self.path.q[-1], 1.0
 
     def start(self, t: float, contact: float = -np.inf) -> None:

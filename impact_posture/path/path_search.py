@@ -14,12 +14,14 @@ from impact_posture.system.arrays import Array
 
 # Largest number of postures that the search pulls onto the constraints for a target.
 EFFORT = 5000
-# An elastic band shortens a path that is longer than the straight distance by more than the first share.  Shortcuts,
-# which need more time, first shorten a path that exceeds the second share.
+# An elastic band shortens a path that is longer than the straight distance by more than the share ``_BENT``.  Beyond
+# the share ``_DETOUR``, shortcuts, which need more time, shorten the path first.
 _BENT, _DETOUR = 0.02, 0.2
 _SHORTCUTS = 24
-# Number of postures of each elastic band, and number of sweeps over a band.
-_BANDS, _SWEEPS = (9, 17, 33), 12
+# Number of postures of each elastic band.
+_BANDS = (9, 17, 33)
+# Number of sweeps over a band.
+_SWEEPS = 12
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,8 +13,10 @@ from impact_posture.posture.manifold.feasible_start import Projector
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem, equality_jacobian
 from impact_posture.system.arrays import Array
 
-# Largest violation of equalities and of inequalities at a valid posture (m, rad, or the unit of the constraint).
-EQUALITY, INEQUALITY = 1e-6, 1e-8
+# Largest violation of an equality at a valid posture (m, rad, or the unit of the constraint).
+EQUALITY = 1e-6
+# Largest violation of an inequality at a valid posture, in the same units.
+INEQUALITY = 1e-8
 # Largest motion of a frame of the robot between two checked postures, m.
 CHECK_DISTANCE = 2e-2
 # Largest number of steps that separate bodies.
@@ -79,7 +81,7 @@ class PathSpace:
     def apart(self, q: Array) -> Array | None:
         """Return a valid posture near ``q``, shape (nq,), where links or bodies may be too near; ``None`` if none is.
 
-        Only these constraints are not pulled.  Linearized, they are satisfied with a quarter more than the violation.
+        Linearized steps move the bodies apart, each by 1.25 times the violation of the clearance.
         """
         for _ in range(_SEPARATIONS):
             q = self.projector.project(q).q

@@ -18,9 +18,10 @@ from impact_posture.system.arrays import Array
 # Number of intervals of the time-optimal parametrization.  Within an interval, a motion can exceed a limit by up to 1
 # %.
 _GRID = 400
-# Number of evenly spaced instants at which a scaled motion is checked, and number of rows of a table of ``s`` over
-# time.
-INSTANTS, _INVERSE = 61, 2001
+# Number of evenly spaced instants at which a scaled motion is checked.
+INSTANTS = 61
+# Number of rows of a table of ``s`` over time.
+_INVERSE = 2001
 # Velocity limit that is assumed for a joint without a velocity limit, rad/s or m/s.
 _DEFAULT_SPEED = 1.0
 # A limit is active if a motion needs more than this share of it.
@@ -61,8 +62,8 @@ def time_optimal(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> 
             discretization_scheme=DiscretizationType.Interpolation,
         ),
     ]  # fmt: skip
-    # The parameter is the path length, because TOPP-RA loses digits if the derivative
-    # of the posture by the parameter is far from 1.
+    # The parameter is the path length, so that the derivative of the posture with respect to the parameter has
+    # norm 1.  TOPP-RA loses digits if this norm is far from 1.
     size = space.length([curve.at(z) for z in curve.z])
     places = np.linspace(0.0, 1.0, _GRID + 1)
     planner = TOPPRA(constraints, SplineInterpolator(size * curve.s, curve.z), gridpoints=size * places)

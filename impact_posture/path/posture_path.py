@@ -30,9 +30,10 @@ _EVERYWHERE = "velocity limits and position limits of the joints in every postur
 _OPTIMA = 5
 # An optimum with a larger objective is struck instead if its speed exceeds the greatest speed so far by this factor.
 _FASTER = 1.02
-# A path below the tangent length ``_NO_MOTION`` counts as no motion.  A relative gain below ``_NO_GAIN`` counts as no
-# gain.
-_NO_MOTION, _NO_GAIN = 1e-6, 1e-6
+# A path below this tangent length counts as no motion, rad mixed with m.
+_NO_MOTION = 1e-6
+# A relative reduction of the objective below this value counts as no reduction.
+_NO_GAIN = 1e-6
 # Largest number of reached postures to evaluate if no optimum is reached.
 _MOST_VISITED = 400
 

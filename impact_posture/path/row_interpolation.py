@@ -50,7 +50,8 @@ class RowInterpolation:
         """
         start, end, h = self.q[k], self.q[k + 1], self.t[k + 1] - self.t[k]
         turn = pin.dDifference(self.model, start, end, pin.ARG1)
-        # Ignore the change of this matrix, which is of second order in the step, and zero for joints of one axis.
+        # The change of this matrix along the step is ignored.  It is of second order in the step, and zero for joints
+        # of one axis.
         v, a = self.v[k] * h, self.a[k] * h**2
         gap = np.array(pin.difference(self.model, start, end)) - v - a / 2
         speed, bend = h * (turn @ self.v[k + 1]) - v - a, h**2 * (turn @ self.a[k + 1]) - a

@@ -19,12 +19,16 @@ from impact_posture.system.arrays import Array
 # Lengths of a stroke, s, measured as the time at the velocity of the impact.  A length is used if the shorter lengths
 # do not suffice.
 _LENGTHS = (0.1, 0.5, 1.5)
-# Tangent length between two knots of a stroke, and largest tangent length, rad mixed with m.
-_KNOTS, _FARTHEST = STEP / 2, 1.5
+# Tangent length between two knots of a stroke, rad mixed with m.
+_KNOTS = STEP / 2
+# Largest tangent length of a stroke, rad mixed with m.
+_FARTHEST = 1.5
 # Least tangent speed with which a curve is computed, rad/s mixed with m/s.
 _AT_REST = 1e-9
-# Least number of knots, and how often the length of a curve is halved until its knots suffice.
-_LEAST, _HALVINGS = 8, 3
+# Least number of knots of a stroke.
+_LEAST = 8
+# Number of times that the length of a curve is halved at most, until its knots suffice.
+_HALVINGS = 3
 # A stroke ends where its velocity exceeds this multiple of ``u``, the velocity at the posture ``q``.
 _FASTER = 3.0
 # A stroke ends where inequalities or joint limits deflect a step by more than this share of its planned length.
@@ -33,8 +37,10 @@ _DEFLECTED = 0.01
 _RANK = 1e-9
 # Shortest duration of a stroke, s, which a controller can follow: without rotors, and with rotors, whose thrust lags.
 SHORTEST = (RUN_UP, 0.2)
-# Ratio of successive trial durations, and number of bisections between two of them.
-_LONGER, _BISECTIONS = 1.3, 5
+# Ratio of successive trial durations of a stroke.
+_LONGER = 1.3
+# Number of bisections between two trial durations.
+_BISECTIONS = 5
 # Number of instants at which a stroke is checked.
 _INSTANTS = 25
 # A stroke uses at most this share of the range of torques and thrusts.  The rest is left to the controller.

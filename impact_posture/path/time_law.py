@@ -12,8 +12,10 @@ from impact_posture.system.arrays import Array
 if TYPE_CHECKING:
     from scipy.interpolate import PPoly
 
-# A jump of the acceleration becomes a ramp of this duration, s, which is at most this share of the motion.
-RAMP, _SHARE = 2e-3, 0.05
+# A jump of the acceleration becomes a ramp of this duration, s.
+RAMP = 2e-3
+# Largest duration of a ramp, as a share of the duration of the motion.
+_SHARE = 0.05
 # Decimals of a time in seconds, because the times of a ``JointTrajectory`` are whole nanoseconds.
 DIGITS = 9
 # A jump of ``s̈`` below this share of the largest jump needs no row of its own.

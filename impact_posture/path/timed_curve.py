@@ -15,13 +15,16 @@ from impact_posture.path.row_interpolation import Moment, RowInterpolation
 from impact_posture.path.time_law import DIGITS, TimeLaw
 from impact_posture.system.arrays import Array
 
-# Largest time between two rows, s, and the least number of rows.
-SAMPLE_TIME, _LEAST_POINTS = 0.01, 21
+# Largest time between two rows, s.
+SAMPLE_TIME = 0.01
+# Least number of rows.
+_LEAST_POINTS = 21
 # Instants between two rows at which the interpolation is compared with the motion, as shares of the interval.
 BETWEEN = (0.2, 0.5, 0.8)
-# Largest difference between the loads of interpolation and motion, relative to the load limit, and largest number of
-# times that an interval is divided.
-_DIFFERENCE, _CUTS = 0.004, 10
+# Largest difference between the load of the interpolation and the load of the motion, relative to the load limit.
+_DIFFERENCE = 0.004
+# Largest number of times that an interval is divided.
+_CUTS = 10
 # For a load without a limit, the difference is relative to the largest value of this load, which counts as at least
 # this share of the largest load.
 _SMALL = 0.01

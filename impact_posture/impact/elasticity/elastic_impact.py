@@ -45,8 +45,10 @@ _SOFTEST, _STIFFEST = 1.0, 1e12
 _LONGEST = 1e8
 # Stiffness that replaces rigid feet in the compliance, relative to the stiffest spring.
 _HELD = 1e8
-# Step between the samples for the peaks, rad of the fastest oscillation; smallest and largest number of samples.
-_SAMPLE, _FEWEST, _MOST = 0.1, 100, 20_000
+# Step between the samples from which the peaks are computed, rad of the fastest oscillation.
+_SAMPLE = 0.1
+# Smallest and largest number of these samples.
+_FEWEST, _MOST = 100, 20_000
 
 
 @dataclass(frozen=True, eq=False)

@@ -58,8 +58,8 @@ class Evaluation(JsonBlock):
         scalars: H, G, V, S and E, computed with the supports; also attributes of the evaluation.
         objective: Value of the objective; for ``impulse`` with the factor λ̄², where λ̄ is the largest impulse of the
             contact.  ``None`` if it does not exist at ``q``.
-        gradient: Tangent gradient of H, shape (nv,).  The entries of a leader also count the motion of its followers,
-            whose entries are zero.
+        gradient: Tangent gradient of H, shape (nv,).  The entry of a leader joint includes the motion of its
+            followers.  The entries of followers are zero.
         objective_gradient: Tangent gradient of the objective, shape (nv,); ``None`` if it does not exist at ``q``.
         normal: Unit normal for which H, G, V, S, E and the jumps are computed, world axes, shape (3,).
         worst_normal: Unit normal for which the objective is computed, world axes, shape (3,).  With a cone of

@@ -12,9 +12,11 @@ from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.model_joints import v_slice
 from impact_posture.system.arrays import Array, null_space
 
-# The direction is singular if the speed along the normal is below the first fraction of the largest speed in any
-# direction.  A singular value of the feet below the second fraction of the largest is a rounding error.
-_SINGULAR, _RANK = 0.05, 1e-9
+# The direction is singular if the speed along the normal is below this fraction of the largest speed in any
+# direction.
+_SINGULAR = 0.05
+# A singular value of the Jacobian of the feet below this fraction of the largest one is a rounding error.
+_RANK = 1e-9
 
 
 @dataclass(frozen=True)

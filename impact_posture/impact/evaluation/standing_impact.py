@@ -13,8 +13,8 @@ from impact_posture.impact.friction.unilateral_impact import StandingFeet, longe
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.system.arrays import Array
 
-# The weight is not counted in a contact of unknown duration.  The search for the duration that would keep the feet on
-# the ground ends at this value, s: no impact lasts longer.
+# Longest contact time in the search for the time at which the weight keeps the feet in place, s.  No impact lasts
+# longer.
 _LONGEST = 0.1
 
 

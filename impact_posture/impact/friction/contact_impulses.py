@@ -13,10 +13,12 @@ import pinocchio as pin
 
 from impact_posture.system.arrays import Array
 
-# Tolerance, largest number of iterations, and rules for the penalty of ADMM.  The second rule is tried if the
-# iteration with the first rule does not converge.  This can happen if the forces on the corners of a sole are not
-# unique.
-_TOLERANCE, _ITERATIONS = 1e-12, 20_000
+# Absolute tolerance of ADMM, after scaling.
+_TOLERANCE = 1e-12
+# Largest number of iterations of ADMM.
+_ITERATIONS = 20_000
+# Rules for the penalty of ADMM.  The second rule is tried if ADMM does not converge with the first rule.  This can
+# happen if the forces on the corners of a sole are not unique.
 _RULES = (pin.ADMMUpdateRule.SPECTRAL, pin.ADMMUpdateRule.OSQP)
 # Largest error of impulses that fulfill the conditions, divided by the largest impulse.
 _ERROR = 1e-7

@@ -52,8 +52,8 @@ class ContactStability(JsonBlock):
     Attributes:
         friction: Least friction coefficient for which all feet stay in place; infinite if above ten; ``None`` if a
             foot lifts or a sole tips for every friction coefficient.
-        feet: Impulse on each foot.  The impulses are within the friction cones if possible; otherwise, they have the
-            least pull.
+        feet: Impulse on each foot.  The impulses are within the friction cones if possible.  Otherwise, the largest
+            pull of the ground is as small as possible.
         freedom: Dimension of the set of possible impulses; zero if the impulses are unique.
     """
 

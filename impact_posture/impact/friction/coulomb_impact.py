@@ -26,8 +26,10 @@ _RANK = 1e-9
 # Number of Newton steps for the equation 1/‖w‖ = 1/μ.  The steps converge from below.  In a test with 10⁵ random B of
 # condition up to 10⁶, one B needed ten steps, and all others fewer.
 _STEPS = 10
-# The numeric iteration ends after this many steps, or at a step of this relative size.
-_MOST_STEPS, _ROUNDING = 60, 1e-15
+# The numeric iteration ends after this number of steps.
+_MOST_STEPS = 60
+# The numeric iteration also ends at a step of this relative size.
+_ROUNDING = 1e-15
 # A friction coefficient below this value is regarded as zero.
 NO_FRICTION = 1e-15
 

@@ -29,13 +29,13 @@ from impact_posture.robot.robot_spec import Support
 from impact_posture.system.arrays import Array
 
 # A contact point moves if its speed is above this share of the approach speed.  A moving point lifts if its upward
-# speed is above a tenth of this value; otherwise it slides.
+# speed is above a tenth of this share; otherwise it slides.
 _MOVES = 0.01
 # Number of steps of an impact in which the weight is counted.
 _STEPS = 8
 # Resolution of the shortest contact time at which the feet stay, as a share of the largest time.
 _SHORTEST = 1e-4
-# A robot with locked joints stands if its feet balance the weight up to this share.
+# A robot with locked joints stands if its feet balance the weight up to this share of the weight.
 _STANDS = 1e-6
 
 
@@ -89,7 +89,7 @@ class StandingFeet:
         return np.asarray(self._oracle.robot.projector @ np.linalg.solve(self.M, J.T))
 
     def _carried(self) -> Array | None:
-        """Return the forces on the feet under the weight; they stop a rigid robot that has fallen for one second."""
+        """Return the forces that carry the weight: impulses that stop a rigid robot after a fall of one second."""
         model, base = self._oracle.robot.model, self.jacobian[:, :6]
         fall = np.tile(np.array(model.gravity.linear), (len(self.frames), 1))
         B = base @ np.linalg.solve(self._oracle.numeric.mass_matrix()[:6, :6], base.T)

@@ -16,8 +16,8 @@ from impact_posture.impact.impact_contact import point_on
 from impact_posture.impact.metric import Metric
 from impact_posture.system.arrays import Array
 
-# For each attempt: initial distance of the unknown t of :func:`worst_of` from its lower bounds, in units of the
-# scale.  The interior-point method needs a start that satisfies the inequalities strictly.
+# Initial distance of the unknown t of :func:`worst_of` from the lower bounds of t, in units of the scale, for each
+# attempt.  The interior-point method needs a start that satisfies the inequalities strictly.
 ABOVE = (0.01, 1.0, 0.1)
 
 

@@ -24,10 +24,10 @@ ACTIVE = 1e-6
 class ModelSet:
     """The largest objective over several robot models.
 
-    With the objective ``f_k`` of the k-th model, the problem ``min_q max_k f_k(q)`` becomes ``min t`` with ``t ≥
-    f_k(q)`` for all k.  Models between the variants are not included;
+    With the objective ``f_k`` of the k-th model, the problem ``min_q max_k f_k(q)`` becomes ``min t`` with
+    ``t ≥ f_k(q)`` for all k.  Models between the variants are not included;
     :mod:`impact_posture.posture.analysis.robustness` samples them.  ``members`` contains the worst case for each
-    model, first for the nominal model.
+    model, the nominal model first.
     """
 
     members: tuple[WorstCase, ...]

@@ -15,8 +15,8 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-# With these numbers of Newton steps, the normal has full precision for cones up to 89.9° and for values of p, gap and
-# a over 16 decades.
+# Numbers of Newton steps for a normal on the edge and for a normal inside the cone.  The normal then has full
+# precision for cones up to 89.9° and for values of p, gap and a over 16 decades.
 _EDGE_STEPS, _INSIDE_STEPS = 8, 14
 # Divisor that replaces zero: smaller than all relevant values, but not zero in single precision.
 _TINY = 1e-30

@@ -3,8 +3,8 @@
 :func:`draw_all` writes the figures of a result.  :func:`figures_of_run`, :func:`figures_of_comparison` and
 :func:`bars_figure` return the figures of simulated runs.
 
-A function raises :class:`~impact_posture.errors.InputError` without data for its figure, or if the runs belong
-to different scenarios or robots.  The package does not change the global state of pyplot and shows no window.
+A function raises :class:`~impact_posture.errors.InputError` if the data for the figure are missing, or if the runs
+belong to different scenarios or robots.  The package does not change the global state of pyplot and shows no window.
 """
 
 from __future__ import annotations

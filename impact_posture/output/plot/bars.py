@@ -20,7 +20,7 @@ NOTES = (
     "∫‖ν‖dt mixes meters and radians, as in the paper. Intervals: 95 % of the mean over the seeds. The paper does "
     "not print its controller gains. Compare the numbers of the paper only with each other.",
 )
-# The axis is long enough for values of the paper up to this multiple of the largest mean.
+# The axis includes values of the paper up to this multiple of the largest mean.
 _FAR = 2.0
 
 
@@ -65,7 +65,8 @@ def bars_figure(rows: Sequence[Bar]) -> Figure:
 def _panel(axes: Any, name: str, group: Sequence[Bar], room: int) -> None:
     ours = max((row.mean + row.half_width for row in group if np.isfinite(row.mean)), default=0.0)
     papers = [row.paper for row in group if row.paper is not None]
-    # The paper used another robot, so its values can be much larger.  These values must not make the bars short.
+    # The paper used another robot, so the values of the paper can be much larger.  An axis for all of them would make
+    # the bars short.
     near = [paper for paper in papers if paper <= _FAR * ours or ours == 0]
     end = 1.08 * (max([ours, *near]) or 1.0)
     for place, row in enumerate(group):

@@ -56,7 +56,7 @@ NOTES = (
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """Ellipsoid to draw: name in the legend, quantities ``at`` the posture, line style; ``free``: no supports."""
+    """Ellipsoid to draw, with its name and line style; if ``free`` is true, the ellipsoid without supports."""
 
     word: str
     at: ImpactQuantities

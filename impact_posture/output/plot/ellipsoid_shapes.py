@@ -118,8 +118,8 @@ def polar(matrix: Array, infinite: float) -> tuple[Array, Array]:
     """Return the matrix ``A⁻¹`` of the ellipsoid ``{f: fᵀAf ≤ 1}``, and its unbounded directions.
 
     ``A`` is positive semidefinite, shape (3, 3).  The ellipsoid is the polar dual of ``{x: xᵀA⁻¹x ≤ 1}``.  It is
-    unbounded in the null space of ``A``.  There, the returned matrix has the half-length ``infinite``.  The unbounded
-    directions are columns, shape (3, k).
+    unbounded in the null space of ``A``.  In these directions, the returned ellipsoid has the half-length
+    ``infinite``.  The unbounded directions are columns, shape (3, k).
     """
     values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
     bounded = values > 1e-10 * max(float(values[-1]), 1e-300)

@@ -27,9 +27,9 @@ _ROW = 0.17
 def jump_figure(view: ResultView) -> Figure:
     """Draw Δν as horizontal bars, per impulse and for the approach speed v.
 
-    The left column shows ``a = M⁻¹Jᵀn`` per N·s.  The right column shows ``a(1+e)v/G``, and as diamonds the jump with
-    friction, if it is defined.  Linear and angular velocities of the base, turning joints and sliding joints have
-    separate panels.
+    The left column shows ``a = M⁻¹Jᵀn`` per N·s.  The right column shows ``a(1+e)v/G``.  Diamonds in this column show
+    the jump with friction, if this jump is defined.  Linear and angular velocities of the base, turning joints and
+    sliding joints have separate panels.
     """
     groups = groups_of(view)
     gain = normal_jump(view.speed, view.restitution)

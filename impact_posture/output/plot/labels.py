@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from impact_posture.output.plot.ellipsoid_shapes import Plane
 from impact_posture.system.arrays import Array
 
-# Distances of a letter from its position (in points, 1/72 inch), directions to try (rad), and smallest distance of a
-# letter from lines (in points).
+# Distances of a letter from its position that are tried, points (1/72 inch).
 _GAPS = (2.0, 5.0, 9.0, 14.0, 20.0, 27.0, 36.0)
+# Directions from the position to the letter that are tried, rad.
 _ANGLES = np.linspace(0.0, 2 * np.pi, 24, endpoint=False)
+# Smallest distance of a letter from lines, points.
 _CLEAR = 1.4
 # Pixels darker than this, 0 (black) to 255, count as lines.  The limit includes thin gray lines, but not grids.
 _INK = 205

@@ -188,7 +188,7 @@ def _objective(axes: Any, data: TradeOffData, view: ResultView) -> None:
 
 
 def _title(data: TradeOffData) -> str:
-    """Return the title: the gain at the knee, or without a knee the gain at half of the distance or extra force."""
+    """Return the title: the reduction at the knee, or else at half of the distance or of the extra force."""
     y, x = data.objective, data.within - data.within[0]
     gain = float(y[0] - y[-1])
     if not gain > 0:
@@ -228,7 +228,7 @@ def motion_figure(view: ResultView) -> Figure:
     notes += ["Dotted lines: start of the run-up (the speed rises smoothly), and contact."] if motion.strike else []
     with framed(*header_lines(view), 6.2, notes) as (figure, body):
         joints, objective, shares = body.subplots(3, 1, sharex=True, height_ratios=[1.4, 1, 1])
-        # The integral of the velocity is continuous.  An angle would jump after a full turn.
+        # The curves show the integral of the velocity, because an angle would jump after a full turn.
         played = motion.played
         t, q, v = played.t, played.q, played.v
         steps = np.diff(t)[:, None] * (v[1:] + v[:-1]) / 2

@@ -22,8 +22,10 @@ if TYPE_CHECKING:
 _CURVES = "Each curve is one component: it is closed, or runs from one limit to another."
 _SURFACES = "Each panel is one component, over the two joints that move most on it; sheets may lie over each other."
 _GRAY = "Gray: limits or inequalities are violated. Postures that differ by full turns count as one."
-# Maximum number of surfaces in the figure, and gap between curves as a share of the sum of their lengths.
-_PANELS, _GAP = 4, 0.03
+# Maximum number of surfaces in the figure.
+_PANELS = 4
+# Gap between curves, as a share of the sum of their lengths.
+_GAP = 0.03
 _MARKS: dict[str, dict[str, Any]] = {
     "ends": {"marker": "o", "markersize": 7, "markerfacecolor": "none", "markeredgecolor": INK, "zorder": 5},
     "start": {"marker": "s", "markersize": 6, "color": VERMILLION, "zorder": 6},

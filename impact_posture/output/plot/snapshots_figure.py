@@ -33,7 +33,7 @@ _START_NOTE = "Gray sticks show the robot at the start of the run."
 _NOW: dict[str, Any] = {"color": BLUE, "linestyle": "-", "linewidth": 1.5, "zorder": 3.0}
 # Line styles of the arrow before a push and during a push.
 _PUSH: dict[int, dict[str, Any]] = {1: {"linestyle": (0, (2, 1.5)), "linewidth": 1.2}, 2: {"linewidth": 1.8}}
-# The snapshot before the impact is taken this long before it, s, so that its tick does not contain the impact.
+# Time from the snapshot before the impact to the impact, s.  The tick of the snapshot must not contain the impact.
 _BEFORE = 0.005
 
 

@@ -30,8 +30,8 @@ from impact_posture.system.scratch_folder import scratch_folder
 VERMILLION, BLUE, GREEN, SKY, PURPLE, ORANGE = "#D55E00", "#0072B2", "#009E73", "#56B4E9", "#CC79A7", "#E69F00"
 INK, GRAY, PALE = "#000000", "#6b6b6b", "#d9d9d9"
 
-# Before and after also differ in line style and hatch, so they are distinguishable in a gray print.  The dashed line
-# is on top.  If both lines coincide, the solid line is visible in the gaps.
+# Lines for "before" and "after" also differ in line style and hatch, so they are distinguishable in a gray print.
+# The dashed line is on top.  If both lines coincide, the solid line is visible in the gaps.
 BEFORE: dict[str, Any] = {"color": VERMILLION, "linestyle": (0, (4, 2)), "linewidth": 1.4, "zorder": 3.5}
 AFTER: dict[str, Any] = {"color": BLUE, "linestyle": "-", "linewidth": 1.6, "zorder": 3.0}
 # Lines for the robot without supports are thinner and have other dashes.
@@ -206,7 +206,7 @@ def save_all(figures: Mapping[str, Figure], out_dir: Path, formats: Iterable[str
 
 @contextmanager
 def _undated() -> Iterator[None]:
-    """Hide the date of a reproducible build.  Matplotlib reads it for each PDF, and fails if it is not a number."""
+    """Hide the variable with the date of a reproducible build, because Matplotlib fails if it is not a number."""
     date = os.environ.pop("SOURCE_DATE_EPOCH", None)
     try:
         yield

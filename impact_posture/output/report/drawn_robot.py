@@ -25,8 +25,8 @@ from impact_posture.system.arrays import Array
 from impact_posture.system.libraries import source_key
 from impact_posture.system.text_files import open_regular, read_bytes
 
-# Maximum number of triangles of all meshes on a page.  This maximum limits the size of the page, and the time to draw
-# the robot without a GPU.
+# Maximum number of triangles of all meshes on a page.  More triangles would make the page large, and slow to draw
+# without a GPU.
 _MOST_TRIANGLES = 150_000
 # Number of steps into which the largest extent of a mesh is divided.  Corners are rounded to these steps.
 _LEVELS = 65535

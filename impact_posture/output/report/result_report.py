@@ -60,7 +60,7 @@ def result_summary(prepared: Prepared, view: ResultView, document: dict[str, Any
 
 
 def result_scene(prepared: Prepared, view: ResultView, meshes: bool = False) -> ReportScene:
-    """Return the 3-D scene of a result.  With surroundings, the surface may be behind the contact point."""
+    """Return the 3-D scene of a result.  The surface of a collision constraint may be behind the contact point."""
     around, q = prepared.problem.surroundings, view.q_initial
     if around is not None:
         walls, solids = around.walls_at(q)

@@ -1,4 +1,4 @@
-"""The posture with the least peak force, and the error message if the bound on the peak force is lower."""
+"""The posture with the least peak force, and the error message for a bound below this force."""
 
 from __future__ import annotations
 

@@ -9,11 +9,11 @@ with bounds d from the least price to the price of the optimum.  The price is th
 price is bounded and not penalized, because minimizers of ``objective + w·price`` give only points on the convex hull
 of the curve.
 
-One program, with d as the bound of a row, is solved along two paths: outward from the posture with the least price
-and inward from the optimum.  Each solve starts at the result of the previous solve, and also uses its multipliers if
-this result satisfies the new bound.  For each bound, the best certified result is kept.  If the best result for a
-neighboring bound comes from another path, one more solve starts from this result.  The curve is therefore the lower
-envelope of the paths.
+A single program has d as the bound of a row.  It is solved along two paths: outward from the posture with the least
+price, and inward from the optimum.  Each solve starts at the result of the previous solve.  If this result satisfies
+the new bound, the solve also uses the multipliers of the previous solve.  For each bound, the best certified result
+is kept.  If the best result for a neighboring bound comes from another path, one more solve starts from this result.
+The curve is therefore the lower envelope of the paths.
 """
 
 from __future__ import annotations
@@ -40,15 +40,16 @@ from impact_posture.posture.search.growing_search import Progress, run_start
 from impact_posture.posture.search.multistart import PostureSolution
 from impact_posture.system.arrays import Array
 
-# Tolerance below which two prices are treated as equal, relative or in rad or m.
+# Prices are treated as equal if they differ by less than this: a share of the force, or a distance in rad or m.
 _STILL = 1e-6
 # One posture is better than another if its objective is lower by more than this fraction of the initial objective.
 _EQUAL = 1e-9
 # If the objective increases along the curve by more than this fraction of the initial objective, a note is added.
 _RISE = 1e-6
-# Maximum number of other optima from which a path starts, and maximum number of rounds that start from results of
-# neighboring bounds.
-_PATHS, _ROUNDS = 3, 3
+# Maximum number of optima, other than the best, from which a path starts.
+_PATHS = 3
+# Maximum number of rounds that start from results for neighboring bounds.
+_ROUNDS = 3
 # Maximum number of times that missing rows are added to the program for one point.
 _GROWTH = 8
 # Number of starts of the search for the posture with the least force.
@@ -140,13 +141,13 @@ class _Curve:
         self._scale = problem.objective.value(price.nearest)
         self._best: list[_End | None] = [None] * len(levels)
         self._tried: set[tuple[int, bytes]] = set()
-        # Maps the posture of each result (its bytes) to the values for a warm start from this result.
+        # The key is the posture of a result as bytes.  The value is the warm start from this result.
         self._ends: dict[bytes, WarmStart] = {}
         self.solves = 0
         self._take(0, "outward", price.nearest)
 
     def follow(self, solution: PostureSolution, progress: Progress | None) -> None:
-        """Solve outward from the least price, and inward from the optimum and from optima with lower prices."""
+        """Solve outward from the least price, and inward from the optimum and from other optima with lower prices."""
         last = len(self._levels) - 1
         planned = 2 * last
         self._take(last, "inward", solution.q)

@@ -72,7 +72,7 @@ class Robustness:
 
     @property
     def price(self) -> float | None:
-        """Relative increase of the nominal model's objective from the nominal optimum to the robust optimum."""
+        """Relative increase of the objective of the nominal model from the nominal optimum to the robust optimum."""
         own = self.model_variants[0].own_optimum
         return None if own is None else self.model_variants[0].at_robust / own - 1
 

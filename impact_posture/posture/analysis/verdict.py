@@ -218,9 +218,8 @@ def _better_objective(impact: ResolvedImpact, outcome: str, jumps: tuple[Jump, J
     grown = relative_change(jumps[0].norm, jumps[1].norm) > -SAME
     if (grown or outcome in ("worse", "no better")) and objective.kind != "coulomb" and not objective.others:
         kind = "sticking" if objective.normal_cone_deg else "coulomb"
-        # If the contact sticks at both postures, the jump with friction is the jump that S measures.  At friction 0,
-        # the jump equals the jump that V measures.  If the objective is already S or V in these cases, another
-        # objective is not better.
+        # If the contact sticks at both postures, S measures the jump.  At friction 0, V measures the jump.  If the
+        # objective is already S or V in these cases, another objective is not better.
         slides = impact.contact.friction == 0
         sticks = all(isinstance(jump, CoulombJump) and jump.sticks for jump in jumps)
         same = (kind, "speed" if slides else "", "sticking" if sticks else "")

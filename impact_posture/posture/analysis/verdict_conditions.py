@@ -14,13 +14,12 @@ from impact_posture.impact.resolved_impact import ResolvedImpact
 # If the attainable speed is below the approach speed by less than this fraction, it is treated as sufficient, because
 # the verdict shows only three digits of both speeds.
 _REACHED = 5e-3
-# The prediction neglects the change of posture during the contact.  The change is proportional to the travel of the
-# surface in the compression time, m.  Up to this travel, jumps in `make study-verdict` are within 5 % of the
-# simulation or 1 % of the approach speed.
+# Largest travel of the contact point in the compression time, m, for which the posture is treated as constant.  Up to
+# this travel, jumps in `make study-verdict` are within 5 % of the simulation or 1 % of the approach speed.
 LONG_TRAVEL = 0.015
 # Hint if the joints are too slow and no path strikes.
 _SLOW = "add `approach`, or correct the `speed`"
-# A distance (rad, m) up to this value is a rounding error.
+# A distance between postures (rad, m) up to this value is a rounding error.
 _STILL = 1e-6
 
 

@@ -31,8 +31,9 @@ from impact_posture.system.arrays import Array, independent_rows
 FASTEST = 1e3
 # Shortest duration of a run-up, s, which a controller can follow.
 RUN_UP = 0.1
-# Room of a joint for a run-up, as time at its velocity of the impact, s.  The speed of a run-up rises from rest, so
-# the shortest run-up needs half of its duration.  A tenth is added, because the joint velocities change on the way.
+# Room of a joint for a run-up, s: the time in which the joint crosses this room at its velocity in the impact.  The
+# speed of a run-up rises from rest, so the shortest run-up needs half of its duration.  A tenth is added, because the
+# joint velocities change on the way.
 _ROOM = 1.1 * RUN_UP / 2
 # Share of the velocity limits that the impact of a strike may use, because some joints are faster before the impact.
 _RESERVED = 0.97

@@ -23,8 +23,8 @@ from impact_posture.system.arrays import Array
 _NEAR = 0.01
 # The certificate contains the rows of a pair if its distance minus the clearance is below this value, m.
 _ROWS = 1e-3
-# A pair is added to the program if it violates its clearance by more than this value, m.  The value is half the
-# tolerance of the certificate.
+# A pair is added to the program if it violates its clearance by more than this value, m.  The tolerance of the
+# certificate is twice this value.
 _MISSING = 5e-9
 # Largest number of pairs that one posture adds to the program.  Pairs with the deepest penetration come first.
 # ``_MOST`` is for pairs of links, and ``_MOST_BEHIND`` for pairs of a link and a plane.  Links behind a plane are

@@ -46,7 +46,7 @@ class LinearJoints(ExpressionConstraint):
         name, text = f"coupling of {c.follower}", f"joint '{c.follower}' moves with '{c.leader}'"
         normals, offset = np.array([[1.0, -c.ratio]]), np.array([c.offset])
         constraint = LinearJoints(robot, (c.follower, c.leader), normals, (offset, offset), name, text)
-        # The coupling is mechanical, so the search for conflicts violates it last.
+        # The coupling is mechanical, so the search for conflicts violates other constraints first.
         constraint.price = 10.0
         return constraint
 

@@ -55,7 +55,8 @@ class PairDistances:
         self._latest = np.full(len(self._pairs), -np.inf)
         self._normals = np.zeros((len(self._pairs), 3))
         self._then = np.zeros((2, len(self._pairs), 12))
-        # The last posture, with axes and centers of bodies, normals of planes, and distances or bounds.
+        # The last posture, with the axes and centers of the bodies, the normals of planes, and the distances or
+        # bounds there.
         self._q = np.zeros(0)
         self._axes, self._centers = np.zeros((0, 3, 3)), np.zeros((0, 3))
         self._up = np.zeros((len(self._bodies), 3))

@@ -28,8 +28,8 @@ class Requirements:
         keep: Frames whose pose must not change.
         hold: Joints whose position must not change.
         com_over_feet: Whether the center of mass must stay above the support polygon.
-        com_asked: Whether the user set ``com_over_feet``.  If the user did not set it, the requirement is dropped for
-            feet that span no area.
+        com_asked: Whether the user set ``com_over_feet``.  If not, the requirement is dropped for feet that span no
+            area.
         com_margin: Least horizontal distance of the center of mass from the edges of the support polygon, m.
         keep_contacts: Whether the feet must neither lift off nor slide during the impact.
         holdable: Whether thrusts, torques and foot forces within their limits must be able to hold the posture.

@@ -33,8 +33,10 @@ EQUATIONS = 4
 # Lower bound on n·n.  Without this lower bound, the normal n could shrink to zero if bodies penetrate each other, and
 # the solver could not continue.
 _SHORT = 0.8
-# Initial slack minus penetration (m), and initial length of the normal.  Both unknowns start inside their bounds.
-_ABOVE, _LENGTH = 0.01, 0.98
+# Initial slack minus penetration, m, so that the slack starts inside its bound.
+_ABOVE = 0.01
+# Initial length of the normal, so that the length starts inside its bounds.
+_LENGTH = 0.98
 # Unit of the unknown slack, m: one divided by ``SLACK_PRICE`` in ``posture_nlp.py``.  The multiplier of the slack is
 # then one, which is the initial guess of IPOPT, and a run takes a quarter fewer iterations than with meters.
 _UNIT = 0.02

@@ -40,7 +40,7 @@ from impact_posture.robot.robot_spec import Support
 from impact_posture.robot.support_polygon import polygon_edges
 from impact_posture.system.arrays import Array
 
-# Distance of the bounds of a follower from its limits, rad or m.
+# The bounds of a follower in the program are wider than the limits of this joint by this value, rad or m.
 _WIDER = 0.01
 
 

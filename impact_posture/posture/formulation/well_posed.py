@@ -24,9 +24,11 @@ from impact_posture.posture.program.constrained_problem import (
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array, independent_rows, null_space
 
-# Angle of a trial turn, rad.  The constraints allow the turn if at least this fraction of the angle remains after the
-# projection onto the constraints.
-_TRIAL, _SURVIVES = 0.05, 0.1
+# Angle of a trial turn, rad.
+_TRIAL = 0.05
+# The constraints allow a trial turn if at least this fraction of its angle remains after the projection onto the
+# constraints.
+_SURVIVES = 0.1
 # Number of random feasible postures at which ranks are compared.
 _SAMPLES = 4
 # Singular values up to this value count as zero at a projected posture, which violates the constraints by up to 1e-9.

@@ -1,4 +1,4 @@
-"""Forces that hold a robot at rest and minimize the largest share of its range that an actuator uses."""
+"""Forces that hold a robot at rest and keep every actuator as far as possible from its limits."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from impact_posture.posture.loads.static_load import ForceSource, StaticLoad
 from impact_posture.robot.model_joints import effort_unit
 from impact_posture.system.arrays import Array
 
-# Shares (:class:`Equilibrium`) are treated as equal to the largest share if they differ from it by less than this.
+# A share (:class:`Equilibrium`) is treated as equal to the largest share if the difference is below this value.
 _TIED = 1e-9
 # Maximum number of iterations of ``_even_share``, each of which removes feet that would have to pull.
 _TURNS = 4
@@ -171,7 +171,7 @@ class Equilibrium:
         z, unbalanced, duals = self._least_share(A, b, S, c) or self._least_imbalance(A, b)
         shares = S @ z + c
         # The derivative of the optimal value is the derivative of R τ at fixed z, multiplied by the multipliers of
-        # its rows.
+        # the rows of R τ.
         gradient = duals @ self.rows @ self.load.torque(q, z).by_posture
         worst = np.abs(shares) > np.abs(shares).max(initial=0.0) - _TIED
         jacobian[np.append(unbalanced > 0, worst & (unbalanced == 0))] = gradient

@@ -21,7 +21,8 @@ from impact_posture.posture.loads.equilibrium import Equilibrium
 from impact_posture.posture.loads.static_load import StaticLoad
 from impact_posture.system.arrays import Array
 
-# Rows are added to the program if a posture violates them by more than this, half the tolerance of the certificate.
+# Rows are added to the program if a posture violates them by more than this value.  The tolerance of the certificate
+# is twice this value.
 _KEPT = 5e-9
 # If an actuator share differs from 1 by less than this value, its row may be active and have a multiplier.
 _NEAR = 1e-3

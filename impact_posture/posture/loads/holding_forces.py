@@ -10,8 +10,7 @@ from impact_posture.config.json_block import JsonBlock
 from impact_posture.posture.loads.equilibrium import Equilibrium
 from impact_posture.system.arrays import Array
 
-# Rounding errors of the solver: a share may exceed 1 by this value, and an unbalanced wrench may reach this value in
-# units of the robot's weight.
+# Largest rounding error of the solver: in a share, and in an unbalanced wrench in units of the robot's weight.
 _ROUNDING = 1e-6
 
 

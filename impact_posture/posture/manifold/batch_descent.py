@@ -1,11 +1,11 @@
 """Descend from many postures at once, on the equalities of a problem and within its joint limits.
 
 Each step is the sum of a quasi-Newton step (BFGS) in the tangent space of the equalities and of a Gauss–Newton step
-that returns to the equalities.  Postures that violate the equalities are compared by the Lagrangian ``m − λᵀc``,
-with the merit m, the equalities c and the least-squares multipliers λ.  To first order, the Lagrangian is the merit
-after the return, so a step needs a single evaluation.  The batch stays full, because a new descent can begin when
-another ends.  For an arm, a descent takes about 0.5 ms, and a run of IPOPT about 10 ms.  Clearances and loads have no
-batch function, so descents ignore them.
+that returns to the equalities.  Postures that violate the equalities are compared by the Lagrangian ``m − λᵀc``, with
+the merit m, the equalities c and the least-squares multipliers λ.  To first order, the Lagrangian is the merit after
+the return to the equalities, so a step needs a single evaluation.  The batch stays full, because a new descent can
+begin when another ends.  For an arm, a descent takes about 0.5 ms, and a run of IPOPT about 10 ms.  Clearances and
+loads have no batch function, so descents ignore them.
 """
 
 from __future__ import annotations
@@ -19,20 +19,30 @@ from numpy.typing import NDArray
 from impact_posture.posture.manifold.constraint_manifold import ConstraintManifold, right_inverse, times
 from impact_posture.system.arrays import Array
 
-# Residual (m, rad) with which a descent may begin and end, and the largest residual of an accepted step.
-_NEAR, _DRIFT = 1e-4, 0.1
+# Largest residual of the equalities, m or rad, with which a descent may begin and end.
+_NEAR = 1e-4
+# Largest residual of the equalities, m or rad, after an accepted step.
+_DRIFT = 0.1
 # Largest number of Gauss–Newton steps from a random posture to the equalities.
 _PROJECTING = 10
-# First and largest trust radius (rad, m), and the radius below which a descent gives up.
-_FIRST, _LONGEST, _SHORTEST = 0.3, 0.6, 1e-6
-# Share of the predicted decrease that a step must reach, and the factor that shortens a rejected step.
-_SUFFICIENT, _SHORTER = 1e-4, 0.3
-# A descent ends if the next step would lower the merit by less than this, or after this number of steps.
-_CONVERGED, _STEPS = 1e-3, 80
+# First and largest trust radius, rad or m.
+_FIRST, _LONGEST = 0.3, 0.6
+# A descent ends if its trust radius falls below this value, rad or m.
+_SHORTEST = 1e-6
+# A step is accepted if the merit decreases by at least this share of the predicted decrease.
+_SUFFICIENT = 1e-4
+# Factor that shortens a rejected step.
+_SHORTER = 0.3
+# A descent ends if the next step would lower the merit by less than this value.
+_CONVERGED = 1e-3
+# Largest number of steps of a descent.
+_STEPS = 80
 # Number of times that the active joint limits are chosen anew.
 _ACTIVE_SETS = 3
-# Least cosine between step and change of the gradient for an update, and between direction and steepest descent.
-_CURVED, _DOWNHILL = 1e-3, 1e-2
+# The Hessian is updated only if the cosine between the step and the change of the gradient exceeds this value.
+_CURVED = 1e-3
+# Least cosine between the direction of a step and the steepest descent.
+_DOWNHILL = 1e-2
 
 
 @dataclass
@@ -166,8 +176,8 @@ class BatchDescent:
         for _ in range(_ACTIVE_SETS):
             jacobian[rows] = np.where(free[rows, None, :], at.jacobian[rows], 0.0)
             inverse[rows] = right_inverse(jacobian[rows])
-            # The gradient minus the forces of the equalities: at a limit, the sign of this difference says whether
-            # the limit is active.
+            # The gradient minus the part that the equalities balance.  At a limit, the sign of this difference shows
+            # whether the limit is active.
             multipliers[rows] = times(inverse[rows].transpose(0, 2, 1), at.gradient[rows])
             rest[rows] = at.gradient[rows] - times(at.jacobian[rows].transpose(0, 2, 1), multipliers[rows])
             before, free = free, ~self.manifold.blocked(x, -rest)

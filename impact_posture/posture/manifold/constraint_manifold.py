@@ -65,9 +65,9 @@ class MeritEvaluation:
 class ConstraintManifold:
     """The set ``{q : c(q) = 0}`` for the equalities of a problem with an impact objective.
 
-    Coordinates are chart coordinates ``x`` and tangent vectors ``v``.  Postures that differ by full turns of joints
-    are the same.  A joint whose range is at least a full turn therefore has no limit, and its entries of ``lower``
-    and ``upper``, shape (nx,), are infinite.  The equalities leave at least ``free`` degrees of freedom.
+    A posture is given by chart coordinates ``x``, a motion by a tangent vector ``v``.  Postures that differ by full
+    turns of joints are the same.  A joint whose range is at least a full turn therefore has no limit, and its entries
+    of ``lower`` and ``upper``, shape (nx,), are infinite.  The equalities leave at least ``free`` degrees of freedom.
     """
 
     def __init__(self, problem: ConstrainedProblem) -> None:
@@ -176,8 +176,8 @@ class ConstraintManifold:
     def project(self, x: Array, steps: int = 20, *, within: bool = False, tolerance: float = _CONVERGED) -> Projected:
         """Project postures, shape (N, nx), onto the equalities by Gauss–Newton steps of least norm.
 
-        With ``within``, the postures also stay within the joint limits, along which they slide.  ``tolerance`` is the
-        largest violation of an equality, m or rad, at which a projection ends.
+        If ``within`` is true, the postures also stay within the joint limits; joints at a limit slide along it.
+        ``tolerance`` is the largest violation of an equality, m or rad, at which a projection ends.
         """
         x = np.clip(x, self.lower, self.upper) if within else x.copy()
         value, jacobian = self.equalities(x)

@@ -104,8 +104,8 @@ class Projector:
                 gram = free @ free.T
                 diagonal = gram.reshape(-1)[:: len(gram) + 1]
                 plain = diagonal.copy()
-                # Rows can be duplicates, for example of two frames on one link, so the damping must exceed rounding
-                # errors.
+                # Two frames on one link can give the same row twice.  The matrix is then singular, so the damping
+                # must exceed rounding errors.
                 least = ROUNDING * max(1.0, float(plain.sum()))
             diagonal[:] = plain + (damping * min(1.0, size) + least)
             step = -free.T @ np.linalg.solve(gram, value)

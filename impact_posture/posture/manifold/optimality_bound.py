@@ -59,7 +59,7 @@ class OptimalityBound:
 
 @dataclass(frozen=True, eq=False)
 class _Patches:
-    """Center (N, nx), radius (N,), φ (N,), gradient along the manifold (N, nv) and curvature (N,) of patches."""
+    """N patches: center (N, nx), radius (N,), φ (N,), gradient along the manifold (N, nv) and curvature (N,)."""
 
     x: Array
     radius: Array

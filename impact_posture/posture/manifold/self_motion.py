@@ -17,12 +17,14 @@ from impact_posture.errors import InputError
 from impact_posture.posture.manifold.constraint_manifold import ConstraintManifold
 from impact_posture.system.arrays import Array
 
-# Steps along a curve, rad or m: the first step, the longest step, and the step below which the curve is treated as
-# singular.
-_FIRST, LONGEST_STEP, _SINGULAR = 0.02, 0.08, 1e-7
-# Least cosine of the angle by which the tangent turns in one step, and the cosine above which the next step is
-# longer.
-_TURN, _STRAIGHT = 0.98, 0.995
+# First and longest step along a curve, rad or m.
+_FIRST, LONGEST_STEP = 0.02, 0.08
+# A curve is treated as singular if a shorter step than this would be needed, rad or m.
+_SINGULAR = 1e-7
+# Least cosine of the angle by which the tangent of a curve turns in one step.
+_TURN = 0.98
+# If this cosine is exceeded, the next step is longer.
+_STRAIGHT = 0.995
 # A posture belongs to a node only if its distance from the tangent space of the node is at most this share of its
 # distance from the node.
 _FLAT = 0.2
@@ -31,13 +33,15 @@ _FLAT = 0.2
 _HALF = 0.52
 # Maximum number of nodes of a curve or surface.
 _NODES = 20_000
-# For surfaces: length of a step, least distance between nodes as a share of the step, and number of directions of
-# steps.
-_STEP, _APART, _DIRECTIONS = 0.16, 0.7, 8
-# Radius that a node of a surface covers, as a share of the step.  Consider a point one step away from a node.  The
-# direction of the nearest tried point differs by at most half the angle between tried directions, which bounds the
-# distance to this tried point.  A node lies within the least distance between nodes of the tried point.  The radius
-# is the sum of both distances.
+# Length of a step on a surface, rad or m.
+_STEP = 0.16
+# Least distance between the nodes of a surface, as a share of the step.
+_APART = 0.7
+# Number of directions in which steps from a node of a surface are tried.
+_DIRECTIONS = 8
+# Radius that a node of a surface covers, as a share of the step, is the sum of two distances.  First, a point one
+# step away from a node lies near a tried point, because its direction differs from a tried direction by at most half
+# the angle between these.  Second, each tried point lies within ``_APART`` of a node.
 COVERED = _APART + 2 * np.sin(np.pi / _DIRECTIONS / 2)
 _BATCH = 100
 
@@ -50,8 +54,8 @@ class Component:
         x: Nodes in chart coordinates, shape (N, nx); the nodes of a curve are in their order along the curve.
         s: Path length to each node, rad mixed with m, shape (N,); zeros for a surface.
         radius: Radius of the neighborhood that each node covers, shape (N,).
-        ends: Only ``closed`` for a closed curve; otherwise ``limit``, ``singular`` or ``unfinished`` (too many nodes)
-            for each end of the curve; empty for a surface.
+        ends: How each end of the curve was reached: ``limit``, ``singular`` or ``unfinished`` (too many nodes).  A
+            closed curve has the only entry ``closed``, and a surface has no entry.
     """
 
     x: Array

@@ -18,9 +18,8 @@ from impact_posture.system.arrays import Array, nonnegative_least_squares, null_
 
 # Only an inequality closer to its bound than this (m, rad) can have a multiplier.
 _ACTIVE = 1e-3
-# If the objective is a maximum, functions up to this fraction of f₀ below the maximum contribute a gradient.  The
-# tolerance of the solver is also relative to the initial objective f₀, because the objective may decrease by orders
-# of magnitude.  The tolerance of complementarity is twice this fraction.
+# If the objective is a maximum, functions up to this fraction of the initial objective f₀ below the maximum
+# contribute a gradient.  The tolerance of complementarity is twice this fraction.
 _TIED = 5e-8
 # Weight of complementarity relative to stationarity; it equals the ratio of their tolerances.
 _COMPLEMENTARITY = 10.0

@@ -22,8 +22,8 @@ from impact_posture.system.toolchain import find_compiler, require_compiler, run
 
 CompileMode = Literal["auto", "always", "never"]
 
-# These times are measured with docs/studies/solve.py for talos: compiling 170,000 operations takes about 20 s, and a
-# run of about 25 iterations is then about 30 ms faster.  Only their orders of magnitude matter for the decision.
+# The times are measured with docs/studies/solve.py for talos.  Compiling 170,000 operations takes about 20 s.  A run
+# of about 25 iterations is then about 30 ms faster.  The decision depends only on the orders of magnitude.
 _COMPILE_S_PER_OPERATION = 1.2e-4
 _SAVED_S_PER_OPERATION = 6e-9
 _ITERATIONS = 35

@@ -47,8 +47,8 @@ IPOPT_OPTIONS: dict[str, Any] = {
 # recover.
 WORST_OPTIONS = {"ipopt.theta_max_fact": 1.0}
 CONVERGED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
-# With these options, IPOPT starts from the given unknowns even if they lie on their bounds.  By default, IPOPT moves
-# unknowns away from their bounds and needs iterations to return them.
+# With these options, IPOPT starts from the given unknowns even if they lie on bounds.  By default, IPOPT moves
+# unknowns away from bounds and needs iterations to move them back.
 WARM_OPTIONS = {"ipopt.warm_start_init_point": "yes"} | {
     f"ipopt.warm_start_{name}": 1e-8
     for name in ("bound_push", "bound_frac", "slack_bound_push", "slack_bound_frac", "mult_bound_push")

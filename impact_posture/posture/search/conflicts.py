@@ -25,9 +25,11 @@ _KEPT = 1e-6
 _SLACK_PRICE = 0.03
 # Price of the squared distance from the given posture.  This term makes the solution unique.
 _AWAY_PRICE = 1e-6
-# Maximum number of starts, and of random postures from which the starts are chosen. Starts far from all bodies often
-# lead to a feasible posture when 24 arbitrary starts do not.
-_TRIES, _DRAWN = 24, 200
+# Maximum number of starts.
+_TRIES = 24
+# Maximum number of random postures from which the starts are chosen.  The postures farthest from all bodies often
+# lead to a feasible posture when arbitrary postures do not.
+_DRAWN = 200
 # Number of starts that confirm a conflict known from a nearby target. For panda in front of a wall, two starts are
 # needed to find a way around a body.
 _CONFIRMING = 4

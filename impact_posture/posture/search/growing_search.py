@@ -25,27 +25,33 @@ from impact_posture.system.processes import fork_map
 
 Progress = Callable[[int, int], None]
 
-# If parts can be added to the program, this many starts run before all others.
+# Number of starts that run before all others, if parts can be added to the program.
 FIRST = 2
 # Maximum number of runs from one start; before each further run, missing parts are added to the program.
 _ROUNDS = 10
-# If all starts together have at most this many unknowns, every start is finished, because stopping some would save no
-# time.
+# If all starts together have at most this number of unknowns, every start is finished, because stopping starts would
+# save no time.
 _SMALL = 1000
-# Used unless all starts are finished.  ``_BATCH`` limits the unknowns of all starts that continue together;
-# ``_LEAST`` is the least number of these starts.  A start is dominated if its objective exceeds the best by the share
-# ``_FAR``.  If more starts continued together, the program would get parts that the best starts do not need.  If
-# fewer starts continued together, the program would be built more often.  ``_FAR`` is large because a run after a
-# trap may end below the bound of its start.
-_BATCH, _LEAST, _FAR = 600, 2, 0.05
+# Largest number of unknowns of all starts that continue together.  With more starts, the program would get parts
+# that the best starts do not need.
+_BATCH = 600
+# Least number of starts that continue together.  With fewer starts, the program would be built more often.
+_LEAST = 2
+# A start is dominated, and stops, if its objective exceeds the best objective by this share.  The share is large
+# because a run after a trap may end below the bound of its start.
+_FAR = 0.05
 # Starting processes takes as long as runs with this many unknowns in total.
 _FORK = 200
 # Starts that continue from postures this close (rad, m) share one run, because their runs would end at the same
 # posture.
 _SAME = 1e-6
-# Price of a meter of slack after a trap, maximum number of repetitions, and factor by which each repetition raises
-# the price.  With a fixed price, slack remains if the objective decreases steeply, for example near a stretched ur10.
-HIGH_PRICE, _ANEW, _DEARER = 20 * SLACK_PRICE, 4, 10
+# Price of a meter of slack after a trap.
+HIGH_PRICE = 20 * SLACK_PRICE
+# Maximum number of repetitions of a trapped run.
+_ANEW = 4
+# Factor by which each repetition raises the price.  With a fixed price, slack remains if the objective decreases
+# steeply, for example near a stretched ur10.
+_DEARER = 10
 
 
 @dataclass(frozen=True)
@@ -165,7 +171,8 @@ class GrowingSearch:
             # price of slack, a run stays within the constraints that its start satisfies.
             trapped = {k for k in batch if runs[k].trapped and k not in last}
             if len(runs) < starts and trapped == {*range(FIRST)}:
-                # For each of the first starts, passing through a body lowers the objective by more than the price.
+                # In each of the first starts, a pass through a body lowers the objective by more than the price of
+                # the slack.
                 self._price = HIGH_PRICE
             self._trapped.update(trapped)
             owed |= {k: (r, self.problem) for k, r in lacking.items()}

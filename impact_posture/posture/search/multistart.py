@@ -29,10 +29,12 @@ from impact_posture.posture.search.start_draws import StartDraws
 from impact_posture.posture.search.unseen_optima import SearchEstimate, hits_by_value
 from impact_posture.system.arrays import Array
 
-# Two final postures are the same optimum if their tangent distance and the relative difference of their objectives
-# are below these values.
-SAME_POSTURE, _SAME_OBJECTIVE = 1e-2, 1e-4
-# Objectives, divided by the initial objective, are equal if these decimals are equal.
+# Two final postures can be the same optimum only if their tangent distance is below this value.
+SAME_POSTURE = 1e-2
+# Two final postures can be the same optimum only if the relative difference of their objectives is below this
+# value.
+_SAME_OBJECTIVE = 1e-4
+# Objectives, divided by the initial objective, are compared with this number of decimals.
 _DIGITS = 9
 # If the relative reduction of the objective is below this value, the result is not reported as better.  The jump is
 # the square root of the objective, so the jump then changes by less than 0.05 %.
@@ -179,7 +181,7 @@ def solve(
         values += (1,) * dominated
         estimate = SearchEstimate.of("multistart", values, hits_of_best(optima), bound=dominated > 0)
     else:
-        # Descents stop early in flat valleys.
+        # Descents stop early in flat valleys, so their shares are probably too high.
         more = screening.hops, True, screening.partial
         estimate = SearchEstimate.of("adaptive", screening.values, hits_of_best(optima), *more)
     if estimate.hits_of_best <= 1 and estimate.starts >= _MANY:

@@ -1,11 +1,11 @@
 """Screen many random postures by batch descents, hop from good ends, and choose the starts of IPOPT.
 
 The objective at a posture hardly predicts the optimum to which a descent leads, so each posture descends first
-(:mod:`impact_posture.posture.manifold.batch_descent`).  A hop takes the end of a good descent, gives other values to
-some of its joints, and descends again (D. J. Wales and J. P. K. Doye, "Global optimization by basin-hopping", J.
-Phys. Chem. A 1997), because many optima differ in a few joints only.  Hops from the best end alone seldom leave it.
-The hops that reach a better optimum often start from worse ends.  All limits are counts, so a seed determines the
-result.
+(:mod:`impact_posture.posture.manifold.batch_descent`).  A hop takes the posture where a good descent ended, gives
+other values to some joints, and descends again (D. J. Wales and J. P. K. Doye, "Global optimization by
+basin-hopping", J. Phys. Chem. A 1997), because many optima differ in a few joints only.  Hops from the best end alone
+seldom leave it.  The hops that reach a better optimum often start from worse ends.  No limit is a time, so a seed
+determines the result.
 """
 
 from __future__ import annotations
@@ -25,36 +25,49 @@ from impact_posture.posture.search.start_draws import StartDraws
 from impact_posture.posture.search.unseen_optima import SAME_VALUE, hits_by_value
 from impact_posture.system.arrays import Array
 
-# Number of descents under way.  New descents begin when a quarter of them has ended.  When no more descents may
-# begin, the search does not wait for the slowest descents (at most the share ``_SLOWEST`` of the ended descents),
-# because a small batch takes nearly as long as a large one.
-_WIDTH, _SLOWEST = 512, 1 / 16
-# ``_WORK`` limits the number of descents times the fourth power of the degrees of freedom, because descents of large
-# robots take longer.  At least ``_LEAST`` descents are allowed.
-_WORK, _LEAST = 40_000_000, 16
-# If less than the share ``_REACHED`` of the first random postures reaches the equalities, their ends differ too
-# little.  Then ``_FEASIBLE`` starts that satisfy all constraints descend too, but at most the share ``_PART`` of all
-# allowed descents.
-_REACHED, _FEASIBLE, _PART = 0.4, 128, 1 / 8
+# Number of descents under way.  New descents begin when a quarter of them has ended.
+_WIDTH = 512
+# When no more descents may begin, the search does not wait for the slowest descents, at most this share of the
+# ended descents.  A small batch takes nearly as long as a large one.
+_SLOWEST = 1 / 16
+# Limit of the number of descents times the fourth power of the degrees of freedom, because descents of large robots
+# take longer.
+_WORK = 40_000_000
+# Number of descents that are always allowed.
+_LEAST = 16
+# If less than this share of the first random postures reaches the equalities, their ends differ too little.
+# Descents then also begin from starts that satisfy all constraints.
+_REACHED = 0.4
+# Number of starts that satisfy all constraints.
+_FEASIBLE = 128
+# Largest number of these starts, as a share of all allowed descents.
+_PART = 1 / 8
 # Share of the new descents that are hops.
 _HOPPING = 0.75
 # A hop starts at an optimum with a probability proportional to ``(1 + rank)^-_RANKED / (1 + hops / _TIRED)²``.  The
 # best optimum has the rank 0, and ``hops`` counts the earlier hops from this optimum.
 _RANKED, _TIRED = 0.7, 8
-# A hop gives other values to one of the shares ``_REDRAWN`` of the joints, rounded up.  The share ``_CROSSED`` of all
-# hops takes these values from another optimum; the other hops draw random values.
-_REDRAWN, _CROSSED = (0.1, 0.2, 0.3, 0.5), 0.6
+# A hop gives other values to one of these shares of the joints, rounded up.
+_REDRAWN = (0.1, 0.2, 0.3, 0.5)
+# Share of the hops that take these values from another optimum.  The other hops draw random values.
+_CROSSED = 0.6
 # Distance (rad, m) below which two ends are the same optimum if their merits differ by less than SAME_VALUE.
 _SAME = 0.05
-# The search stops under three conditions.  Random postures and hops from worse ends reached the best merit often
-# enough.  At least ``_ENDS`` descents have ended.  The last share ``_IDLE`` of all ends did not lower the best merit.
-# ``_HITS`` times are enough if the equalities leave at most ``_FREE`` degrees of freedom.  Each further degree
-# doubles this number, because the number of optima grows exponentially with the degrees of freedom.
-_HITS, _FREE, _ENDS, _IDLE = 12, 5, 256, 0.5
+# The search stops when this number of random postures and hops from worse ends reached the best merit, and if the
+# next three values allow it.
+_HITS = 12
+# Degrees of freedom up to which ``_HITS`` suffices.  Each further degree doubles the number, because the number of
+# optima grows exponentially with the degrees of freedom.
+_FREE = 5
+# Least number of ended descents.
+_ENDS = 256
+# Share of all ends, the last ones, that must not have lowered the best merit.
+_IDLE = 0.5
 # Number of starts of IPOPT, half of them at the best ends and half at the most different good ends.  If descents
-# ignored no constraint, a third suffices.  ``_SOLVED`` limits the number of starts times the degrees of freedom,
-# because a solution takes longer for large robots.
-_GUESSES, _SOLVED = 12, 200
+# ignored no constraint, a third suffices.
+_GUESSES = 12
+# Limit of the number of starts times the degrees of freedom, because a solution takes longer for large robots.
+_SOLVED = 200
 # Tag of a descent from a random posture.  The tag of a hop is the end where it started.
 _RANDOM = -1
 
@@ -65,7 +78,7 @@ class Screening:
 
     Attributes:
         guesses: Postures from which IPOPT starts, shape (nq,) each.
-        hits: Number of random postures that descended to each guess.
+        hits: Number of random postures whose descents ended at each guess.
         values: For each distinct objective where descents ended, best first: the number of random postures that
             descended to it.  The last entries are 1, each for a random posture whose descent got stuck.
         partial: Whether the problem has constraints that descents ignore, such as clearances.
@@ -178,7 +191,7 @@ class _Search:
         )
 
     def _hop(self, other: Array) -> tuple[Array, NDArray[np.int_]]:
-        """Return good ends with some joints at values of other ends or of ``other``, (N, nx), and their indices."""
+        """Return good ends with some joints set as at other ends or in ``other``, (N, nx), and the indices of the ends."""
         rng, count = self._rng, len(other)
         rank = np.argsort(np.argsort(self._merit))
         weight = (1 + rank) ** -_RANKED / (1 + self._tries / _TIRED) ** 2

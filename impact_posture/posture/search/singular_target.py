@@ -16,12 +16,14 @@ from impact_posture.robot.model_joints import scalar_value
 from impact_posture.system.arrays import Array
 from impact_posture.system.escape import toml
 
-# A direction is lost if the joints move the constraint along it by less than this share of the fastest direction.
+# A direction is lost if the joints move the constrained frame along it by less than this share of the largest motion.
 _LOST = 1e-3
-# The share above which no direction is nearly lost.
+# A direction is nearly lost up to this share of the largest motion.
 _CLEAR = 5e-3
-# Angle by which joints are bent, rad, and the largest number of these joints.
-_BEND, _MOST_BENT = 0.5, 4
+# Angle by which joints are bent, rad.
+_BEND = 0.5
+# Largest number of bent joints.
+_MOST_BENT = 4
 # Number of random postures without singularity.
 _SAMPLES = 8
 
@@ -32,8 +34,8 @@ class SingularTarget:
 
     Attributes:
         name: Name of the constraint.
-        rank: Largest rank of its Jacobian at the given postures.
-        full_rank: Rank of its Jacobian at random postures.
+        rank: Largest rank of the Jacobian of the constraint at the given postures.
+        full_rank: Rank of this Jacobian at random postures.
         bent: Joint positions at which the rank is full, rad; empty if the target is stated by the user.
     """
 

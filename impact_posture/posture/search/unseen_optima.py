@@ -13,7 +13,7 @@ from impact_posture.config.json_block import JsonBlock
 # Rule of three: if N starts reached each optimum at least twice, at most the share ``_RULE_OF_THREE / N`` of further
 # starts leads to a new optimum, with a confidence of 95 %.
 _RULE_OF_THREE = 3
-# Difference of two objectives, divided by the objective, up to which they count as one.
+# Two objectives count as one up to this relative difference.
 SAME_VALUE = 5e-3
 
 
