@@ -191,7 +191,7 @@ class _Search:
         )
 
     def _hop(self, other: Array) -> tuple[Array, NDArray[np.int_]]:
-        """Return good ends, some joints changed to those at other ends or in ``other``, (N, nx), and their indices."""
+        """Return good ends with some joints as at other ends or in ``other``, shape (N, nx), and their indices."""
         rng, count = self._rng, len(other)
         rank = np.argsort(np.argsort(self._merit))
         weight = (1 + rank) ** -_RANKED / (1 + self._tries / _TIRED) ** 2
