@@ -27,7 +27,8 @@ LARGEST_FILE = 100_000_000
 _SECONDS, _BYTES_PER_SECOND = 5.0, 2_500_000
 # Least time, s, for reading a mesh after other meshes of the robot took too long.
 _LEAST_SECONDS = 0.5
-# Largest number of vertices of a mesh file that has fewer bytes than vertices.  Such a file repeats its parts.
+# A mesh may have this many vertices, or one vertex per byte of its file if this is more.  A short file can repeat its
+# parts a million times.
 _MOST_VERTICES = 200_000
 # Largest number of meshes in memory, which is enough for one robot.
 _MOST_MESHES = 100

@@ -26,12 +26,12 @@ from impact_posture.robot.urdf import EXAMPLE_PREFIX, example_robot_data
 from impact_posture.system.escape import toml
 from impact_posture.system.output_folder import check_name
 
-# Smallest number of joints that lead to the contact frame, and the contact pose that is then guessed.  The guessed
-# pose leaves some freedom of motion.
+# Pairs of a number and a contact pose.  The draft guesses the first pose whose number is at most the number of joints
+# that lead to the contact frame.  This pose leaves some freedom of motion.
 _POSES = ((7, "full"), (6, "aligned"), (4, "position"), (0, "free"))
 # Largest speed of a propeller in a draft, Hz.
 _SPEED = 100.0
-# Smallest distance (m) of the center of mass from the edges of the support polygon for com_over_feet.
+# The draft sets ``com_over_feet`` only if the center of mass is at least this far (m) inside the support polygon.
 _LEAST_DEPTH = 0.02
 # Feet whose heights differ by less than this (m) are at the same height.
 _UNEVEN = 1e-3
@@ -40,8 +40,8 @@ _UNEVEN = 1e-3
 def write_draft(robot: str, options: LoadOptions, out: Path | None, *, force: bool = False) -> tuple[Path, Draft]:
     """Write a commented ``robot.toml`` that can be loaded without changes; return its path and its content.
 
-    ``options`` are data from the user; other data are read or guessed.  By default, ``out`` is ``robot.toml`` beside
-    the URDF or MJCF, or ``./<name>.toml`` for a robot of a collection.
+    ``options`` are data from the user.  The function reads or guesses all other data.  By default, ``out`` is
+    ``robot.toml`` beside the URDF or MJCF, or ``./<name>.toml`` for a robot of a collection.
 
     Raises:
         InputError: The robot is a known name, which has a ``robot.toml`` already.
@@ -226,7 +226,7 @@ def _supports(draft: Draft, robot: Robot, feet: Sequence[Support]) -> None:
 
 
 def _support_depth(robot: Robot, feet: Sequence[Support]) -> float:
-    """Return the distance from the center of mass to the support polygon's edges, m; negative if outside."""
+    """Return the distance of the center of mass from the edges of the support polygon, m; negative outside."""
     model, q = robot.model, robot.posture()
     data = model.createData()
     pin.framesForwardKinematics(model, data, q)

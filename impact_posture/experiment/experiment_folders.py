@@ -48,8 +48,8 @@ def write_simulation(output: Output, job: Job, runs: Sequence[Run], document: Do
     Return the reason why the report is missing.  The text is empty if the report was written or not requested.
 
     Raises:
-        OutputError: The folder exists and ``force`` is false, or the folder contains files that this command did not
-            write, or the folder cannot be written.
+        OutputError: The folder exists and ``force`` is false, it contains files that this command did not write, or
+            it cannot be written.
     """
     with whole_folder(output.folder, force=output.force, kind="run") as folder:
         write_json(folder / SIMULATION, document)
@@ -62,10 +62,11 @@ def write_simulation(output: Output, job: Job, runs: Sequence[Run], document: Do
 def write_comparison(output: Output, comparison: Reproduction, store: JobStore) -> str:
     """Write ``comparison.json``, figures, ``runs/`` and ``report.html``, and remove the store of finished runs.
 
-    Figures, ``runs/`` and the report show the first seed.  The return value is as in :func:`write_simulation`.
+    Figures, ``runs/`` and the report show the first seed.  The return value is the same as in
+    :func:`write_simulation`.
 
     Raises:
-        OutputError: As in :func:`write_simulation`.
+        OutputError: The same errors as in :func:`write_simulation`.
     """
     with whole_folder(output.folder, force=output.force, kind="comparison") as folder:
         write_json(folder / COMPARISON, comparison.comparison())
@@ -83,7 +84,7 @@ def write_reproduction(output: Output, reproduction: Reproduction, store: JobSto
     Return the content of ``reproduction.json``.
 
     Raises:
-        OutputError: As in :func:`write_simulation`.
+        OutputError: The same errors as in :func:`write_simulation`.
     """
     document = {**reproduction.to_dict(), "summary": summary(reproduction)}
     with whole_folder(output.folder, force=output.force, kind="reproduction") as folder:
@@ -101,7 +102,7 @@ def store_beside(out: Path) -> AbstractContextManager[JobStore]:
     """Lock and yield the :class:`JobStore` with finished runs for the output folder ``out``.
 
     Raises:
-        OutputError: As in :meth:`JobStore.locked`.
+        OutputError: The same errors as in :meth:`JobStore.locked`.
     """
     return JobStore(out.absolute().parent / f".{out.name}.runs").locked()
 
@@ -127,7 +128,7 @@ def draw_side_by_side(jobs: Sequence[Job], store: JobStore, folder: Path, format
 
 
 def draw_reproduction(reproduction: Reproduction, store: JobStore, folder: Path, formats: Sequence[str]) -> None:
-    """Draw the figure ``bars``, and figures per scenario that compare nominal, robust and the best controller."""
+    """Draw the figure ``bars``.  For each scenario, draw figures that compare nominal, robust and best controller."""
     bars = []
     for row in reproduction.rows:
         paper, total = PAPER.get(row.scenario), row.metrics.get("q_total_impact")

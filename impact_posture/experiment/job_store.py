@@ -28,7 +28,7 @@ from impact_posture.system.text_files import read_bytes, read_text
 Progress = Callable[[int, int], None]
 # Pattern of the names of stored files, and of incomplete files that a killed process leaves.
 _STORED = re.compile(r"\.?[0-9a-f]{64}(\.minus)?\.(json|npz)(\.\d+\.part)?")
-# Errors that a document of another structure causes.
+# Errors that occur if a document has another structure.
 _BROKEN = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError)
 
 
@@ -51,8 +51,8 @@ class JobStore:
         """Create the folder and lock it against other commands.  Remove the folder at the end if it is empty.
 
         Raises:
-            OutputError: The folder cannot be created or read, another command uses it, or a stored document was
-                changed together with its checksum.
+            OutputError: The folder cannot be created or read, another command uses the folder, or somebody changed a
+                stored document together with its checksum.
         """
         with parents_of(self.folder):
             self._make_folder()

@@ -26,9 +26,9 @@ from impact_posture.system.optional_package import import_mujoco
 Document = dict[str, Any]
 
 SCHEMA = "impact-posture/simulation/4"
-# From this number of runs on, compiling the controller saves time.  For a humanoid, compiling takes about 6 s and
-# saves 4 s in each run.  A library in the cache does not lower this number, because the rounding errors of a run must
-# not depend on earlier runs.
+# Compiling the controller saves time for at least this number of runs.  For a humanoid, compiling takes about 6 s and
+# saves 4 s in each run.  The number is the same if the cache contains the library, because the rounding errors of a
+# run must not depend on earlier runs.
 _PAYS = 2
 
 
@@ -169,8 +169,8 @@ def combined(metrics: list[Metrics]) -> Metrics:
     """Combine the metrics of several runs.
 
     Counts are added, and ``stops`` contains the joints of all runs.  ``peak_jump_max`` and ``peak_force`` are the
-    largest values, and ``joint`` is the worst joint of any run.  ``rested`` is true if it is true for all runs.  All
-    other metrics are means.
+    largest values of all runs, and ``joint`` is the worst joint of all runs.  ``rested`` is true if all runs rested.
+    All other metrics are means.
     """
     first, load = metrics[0], mean_load([m.load for m in metrics])
     if len(metrics) == 1:

@@ -14,8 +14,8 @@ from impact_posture.posture.program.compiled_solver import CompileMode
 from impact_posture.simulation.controllers.controller_factory import CONTROLLERS
 
 SCHEMA, COMPARISON_SCHEMA = "impact-posture/reproduction/3", "impact-posture/comparison/3"
-# ``held`` holds the reached posture and switches the impact-robust term off, so only the posture has an effect.
-# ``free`` uses a metric that ignores the contacts at the feet.
+# ``HELD`` controllers hold the reached posture and switch the impact-robust term off, so only the posture has an
+# effect.  The ``FREE`` controller uses a metric that ignores the contacts at the feet.
 HELD, FREE = ("robust:held", "walker:held"), "robust:free"
 # Name or file of a scenario → labels of its controllers (:func:`parse_controller`).
 Plan = Mapping[str, Sequence[str]]
@@ -36,8 +36,8 @@ class PaperRow:
     reduction: float
 
 
-# Only reductions can be compared with the paper.  The shipped scenarios have other robots, gains and contact models,
-# and the measurement windows of the paper end with the contact.
+# Rows of the paper.  Only their reductions can be compared with this package, because the shipped scenarios have
+# other robots, gains and contact models.  Also, the measurement windows of the paper end with the contact.
 PAPER: dict[str, PaperRow] = {
     "aerial-vertical": PaperRow(10.4, 5.1, 0.51),
     "aerial-lateral": PaperRow(9.2, 5.5, 0.402),
@@ -62,9 +62,9 @@ RECOMMENDED: dict[str, str] = {
 }
 
 # Target → function and text.  The function returns true if a row misses the target.  The second argument of the
-# function is the reduction in the paper.  The text describes the miss.  The target ``recovery`` rejects controllers
-# that only delay the motion.  Saturation times are multiples of a tick, so a difference below 1e-9 s is a rounding
-# error.
+# function is the reduction in the paper.  The text says how the row misses the target.  The target ``recovery``
+# rejects controllers that only delay the motion.  Saturation times are multiples of a tick, so a difference below
+# 1e-9 s is a rounding error.
 _TARGETS: dict[str, tuple[Callable[[ControllerRow, float], bool], str]] = {
     "reduction": (lambda row, paper: _mean(row.reduction) < paper, "less than the paper's reduction"),
     "recovery": (lambda row, _: _mean(row.recovery) <= 0, "no less motion than nominal over the recovery"),
@@ -103,8 +103,8 @@ def missed_targets(row: ControllerRow) -> dict[str, str] | None:
 def best_of(rows: Sequence[ControllerRow]) -> ControllerRow | None:
     """Return the row with the largest reduction among the rows that meet every target.
 
-    If no row meets every target, choose among all rows.  A row is ignored if its robot was not at rest.  The
-    compared reduction is the smaller value of ``reduction`` and ``recovery``.
+    If no row meets every target, choose among all rows.  A row is ignored if the robot was not at rest before the
+    push.  The compared reduction is the smaller value of ``reduction`` and ``recovery``.
     """
     missed = [(row, targets) for row in rows if (targets := missed_targets(row)) is not None and row.rested]
     candidates = [row for row, targets in missed if not targets] or [row for row, _ in missed]
@@ -112,7 +112,7 @@ def best_of(rows: Sequence[ControllerRow]) -> ControllerRow | None:
 
 
 def controllers_of(scenario: str, everything: bool) -> tuple[str, ...]:
-    """Return the labels of the main controllers, or of all if ``everything``; nominal is first."""
+    """Return the labels of the main controllers, or of all controllers with ``everything``; nominal is first."""
     if everything:
         return (*CONTROLLERS, *HELD, *([FREE] if scenario.endswith("-push") else []))
     return tuple(dict.fromkeys(("nominal", "robust", "robust-flow", RECOMMENDED[scenario])))
@@ -201,8 +201,8 @@ def reproduce(
     """Run the controllers of a plan in their scenarios, with the seeds 0 to ``seeds`` − 1.
 
     The store keeps the documents of finished jobs, and the time series of the first seed.  ``progress`` is called
-    with the number of finished jobs and the number of all jobs.  Controllers are compiled ``always``, ``never``, or
-    if this saves time (``auto``).
+    with the number of finished jobs and the number of all jobs.  ``compile`` decides whether controllers are
+    compiled: ``always``, ``never``, or only if this saves time (``auto``).
 
     Raises:
         ImpactPostureError: A scenario cannot be set up, a controller does not exist, MuJoCo is not installed, or the

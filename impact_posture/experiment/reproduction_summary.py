@@ -29,7 +29,7 @@ LEGEND = (
 def table_one(results: Reproduction) -> str:
     """Return a Markdown table of ``q_total_impact``, with one row per scenario.
 
-    A row contains the values of the paper (nominal, robust) and our values (nominal, robust, best controller).
+    A row contains the values of the paper (nominal, robust) and of this package (nominal, robust, best controller).
     """
     head = "scenario|paper: nominal|robust|reduction|ours: nominal|robust|reduction|best|reduction"
     lines = []
@@ -46,7 +46,7 @@ def table_one(results: Reproduction) -> str:
 
 
 def fitted(results: Reproduction) -> str:
-    """Return a Markdown list: values fitted to the paper, and the ratio of our nominal value to the paper's."""
+    """Return a Markdown list of the values fitted to the paper, and the nominal values divided by the paper's."""
     lines = []
     for scenario in results.scenarios:
         paper, nominal = PAPER.get(scenario), results.row(scenario, "nominal")
@@ -144,7 +144,7 @@ def advice(results: Reproduction, others: Reproduction | None = None) -> list[st
 
 
 def _force(best: ControllerRow, nominal: ControllerRow | None) -> str:
-    """Return a sentence about the contact force if it is more than 10 % larger than with nominal."""
+    """Return a sentence about the contact force if it is more than 10 % larger than with the nominal controller."""
     if nominal is None:
         return ""
     before, after = (row.metrics["peak_force"].mean for row in (nominal, best))
@@ -152,7 +152,7 @@ def _force(best: ControllerRow, nominal: ControllerRow | None) -> str:
 
 
 def _held(best: ControllerRow, held: ControllerRow | None) -> str:
-    """Return a warning if ``held``, the effect of the posture alone, is at most half of the reduction."""
+    """Return a warning if ``held``, the effect of the posture alone, is at most half of the total reduction."""
     share = _share(held, best)
     if share is None or share > 0.5:
         return ""

@@ -25,7 +25,7 @@ _METRICS = (
     ("peak_force", "N", "largest normal force in the impact windows"),
     ("slip", "m", "way that the contact slid in the impact windows"),
 )
-# Effects on base, joints and contact just after the touch: key, unit and meaning.
+# Effects on base, joints and contact just after the robot touches the surface: key, unit and meaning.
 _LOADS = (
     ("base_linear", "m/s", "largest change of the base's linear velocity, mean of the contacts"),
     ("base_angular", "rad/s", "the same of its angular velocity"),
@@ -41,7 +41,7 @@ _PUSH_MEANINGS = {
     "peak_force": "the push",
     "slip": "way that the fastest foot slid in the impact windows",
 }
-# Time between two ticks that a report shows, within impact windows and outside them, s.
+# Time between two ticks that a report shows, s: ``FINE`` within impact windows, ``COARSE`` outside impact windows.
 FINE, COARSE = 0.001, 0.025
 _MOVES = (
     f"The slider goes through time: every {1e3 * FINE:g} ms within the impact windows, every {1e3 * COARSE:g} ms "

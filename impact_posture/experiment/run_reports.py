@@ -31,7 +31,7 @@ from impact_posture.system.output_folder import write_json
 from impact_posture.system.text_files import read_text
 
 SIMULATION, COMPARISON, RUNS = "run.json", "comparison.json", "runs"
-# If a position exceeds this value, the state has diverged, m or rad.
+# The state has diverged if a position exceeds this value, m or rad.
 _AWAY = 1e3
 # Columns of :class:`Series` that figures use.
 _COLUMNS = {field.name for field in fields(RunView)} & {field.name for field in fields(Series)}

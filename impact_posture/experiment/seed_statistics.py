@@ -93,7 +93,8 @@ class ControllerRow:
         stops: Joints that reached a position limit within an impact window of any run.
         rested: True if the robot was at rest before every push.
         H: Mean of H just before the impacts.
-        ratio: Mean of the measured jump divided by the jump that the rigid-body model predicts with friction.
+        ratio: Mean of the measured velocity jump divided by the jump that the rigid-body model with friction
+            predicts.
         force: ``peak_force`` divided by its nominal value with the same seed; ``None`` if ``reduction`` is ``None``.
         joint: The worst joint of any completed run.
         approach: Mean of the approach speed, m/s; ``None`` for pushes.
@@ -119,7 +120,7 @@ class ControllerRow:
 
 
 def headline(row: Document, nominal: Document) -> str:
-    """Return one line on a controller: its motion, peak jump and peak force, relative to nominal, and the outcome.
+    """Return one line on a controller: the outcome, and motion, peak jump and peak force relative to nominal.
 
     The outcome follows from the effects on base, joints and contact, by the rule of the verdict of ``optimize``
     (:func:`~impact_posture.posture.analysis.verdict_changes.outcome_of`).  Both arguments are rows of
@@ -129,7 +130,7 @@ def headline(row: Document, nominal: Document) -> str:
     parts = [f"{row['controller']} moves {abs(less):.0%} {'less' if less > 0 else 'more'}"]
     change = row["change"]["peak_jump"]["mean"] / nominal["metrics"]["peak_jump"]["mean"]
     costs = [f"peak jump {change:+.0%}"]
-    # The peak force of a push is the push.
+    # In a push scenario, the peak force is the force of the push, so it does not change.
     if abs(row["force"]["mean"] - 1) > _SAME:
         costs.append(f"peak force × {row['force']['mean']:.2g}")
     parts.append(", ".join(costs))
@@ -188,7 +189,7 @@ def row_of(
     good = [d for d in documents if d["status"] == "completed"]
     base = {d["seed"]: d for d in nominal}
     pairs = [(d, base[d["seed"]]) for d in documents if d["seed"] in base]
-    # If a run failed, compare none, because the remaining runs are not a representative sample.
+    # If a run failed, compare no runs, because the remaining runs are not a representative sample.
     fair = bool(pairs) and len(good) == len(documents) and all(n["status"] == "completed" for _, n in pairs)
 
     def paired(name: str, compare: Callable[[float, float], float]) -> Interval:

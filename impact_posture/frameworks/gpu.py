@@ -25,9 +25,9 @@ from impact_posture.system.text_files import read_text
 if TYPE_CHECKING:
     from impact_posture.robot.robot import Robot
 
-# DLPack's number of a CUDA device.
+# Number of the device type CUDA in DLPack.
 _CUDA = 2
-# Last words of the names of a joint's entries in q → how many entries it has in ν.
+# Last words of the names of a joint's entries in q → number of entries of the joint in ν.
 _JOINTS = {
     ("x (m)", "y (m)", "z (m)", "qx", "qy", "qz", "qw"): 6,
     ("x (m)", "y (m)", "cos", "sin"): 3,
@@ -40,7 +40,7 @@ _JOINTS = {
 def load(
     path: str | Path, *, robot: Robot | None = None, frame: str | None = None, free: bool = False
 ) -> BatchMetric:
-    """Load an export for batches; arguments and errors are as in :meth:`ImpactGradient.load`.
+    """Load an export for batches; arguments and errors are the same as in :meth:`ImpactGradient.load`.
 
     Loading runs the code of the export.
     """
@@ -51,8 +51,8 @@ def load(
 class BatchMetric:
     """``H`` and the objective of an export, with gradients, for many configurations.
 
-    The results are arrays of the package, floating-point type and device of ``q``.  If ``q`` is on the CPU, the C
-    code computes the rows on all cores.  If ``q`` is on an NVIDIA GPU, the CUDA code computes the rows there.  The
+    The results have the package, floating-point type and device of ``q``.  If ``q`` is on the CPU, the C code
+    computes the rows on all cores.  If ``q`` is on an NVIDIA GPU, the CUDA code computes the rows on this GPU.  The
     rows of a configuration that fails are NaN.
 
     By default, gradients are **tangent** gradients, shape (N, nv): entry i is the derivative along ``ν_i``.  For a
@@ -90,8 +90,8 @@ class BatchMetric:
         """Return the objective of the export, shape (N,), and its gradients.
 
         Raises:
-            InputError: As in :meth:`value_and_gradient`.
-            SpecError: An earlier version wrote the export, without a batch of the objective.
+            InputError: The same errors as in :meth:`value_and_gradient`.
+            SpecError: An earlier version wrote the export, which therefore lacks a batch of the objective.
         """
         return self._call("objective", q, None, in_q)
 
@@ -173,7 +173,7 @@ class BatchMetric:
 
 
 def _joints(q_names: Sequence[str]) -> Iterator[tuple[tuple[str, ...], int, int]]:
-    """Yield names of entries, first entry in q and first entry in ν of each joint whose numbers in q and ν differ."""
+    """Yield each joint with more entries in q than in ν: names of the entries, first entry in q, first entry in ν."""
     at = speed = 0
     while at < len(q_names):
         for names, size in _JOINTS.items():

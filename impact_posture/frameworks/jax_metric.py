@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def load(path: str | Path, *, robot: Robot | None = None, frame: str | None = None, free: bool = False) -> JaxMetric:
-    """Load an export for JAX; arguments and errors are as in :meth:`ImpactGradient.load`.
+    """Load an export for JAX; arguments and errors are the same as in :meth:`ImpactGradient.load`.
 
     Raises:
         InputError: JAX is not installed.
@@ -64,7 +64,7 @@ class JaxMetric:
         return q.astype(self._jax.numpy.result_type(q, float))
 
     def _differentiable(self) -> Any:
-        """Return the function of ``q`` and ``n`` that returns ``H``, or of ``q`` that returns the objective."""
+        """Return the function ``(q, n)`` → ``H``, or the function ``q`` → objective."""
         jax = self._jax
 
         def on_host(q: Any, *n: Any) -> tuple[Any, Any]:

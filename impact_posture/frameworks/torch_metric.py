@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 def load(
     path: str | Path, *, robot: Robot | None = None, frame: str | None = None, free: bool = False
 ) -> TorchMetric:
-    """Load an export for PyTorch; arguments and errors are as in :meth:`ImpactGradient.load`.
+    """Load an export for PyTorch; arguments and errors are the same as in :meth:`ImpactGradient.load`.
 
     Raises:
         InputError: PyTorch is not installed.
@@ -29,8 +29,8 @@ class TorchMetric:
     """``H`` and the objective of an export, differentiable with respect to ``q`` once.
 
     ``q`` has shape (…, nq), and results have shape (…).  The derivative is with respect to the entries of ``q``.  For
-    a floating base, it is the derivative of ``H(u(q))``, where ``u`` normalizes the quaternion, so an optimizer may
-    change the four numbers freely.  The tangent gradient, shape (N, nv), is
+    a floating base, it is the derivative of ``H(u(q))``, where ``u`` normalizes the quaternion.  Therefore, an
+    optimizer may change the four numbers of the quaternion freely.  The tangent gradient, shape (N, nv), is
     ``metric.batch.value_and_gradient(q.detach(), n)``.
 
     Attributes:
@@ -45,7 +45,7 @@ class TorchMetric:
         """Return ``H`` for the unit normal ``n``, shape (3,) or (…, 3), which must not require a gradient.
 
         Raises:
-            InputError: ``n`` requires a gradient, or as in :meth:`BatchMetric.value_and_gradient`.
+            InputError: ``n`` requires a gradient, or :meth:`BatchMetric.value_and_gradient` raises the error.
         """
         if getattr(n, "requires_grad", False):
             raise InputError("the derivative with respect to n is not computed", where="n", hint="detach n")

@@ -86,7 +86,8 @@ def thrust_limits(propulsion: PropulsionSpec) -> tuple[float, float]:
 def torque_limits(model: pin.Model) -> Array:
     """Return the largest torque of each velocity entry, N·m or N, shape (nv,).
 
-    The torque is infinite for a limit of zero (not stated), a floating base, and a locked joint (infinite armature).
+    The torque is infinite for a floating base, for a locked joint (infinite armature), and for a joint whose limit is
+    zero, because zero means that the file states no limit.
     """
     limits = np.array(model.effortLimit, dtype=float)
     unknown = ~(np.isfinite(limits) & (limits > 0)) | finite_armature(model)[1]
@@ -98,8 +99,9 @@ def allocation_matrix(model: pin.Model, propulsion: PropulsionSpec) -> Array:
     """Return the map from rotor thrusts (N) to the base wrench ``[force; moment]``, shape (6, rotors).
 
     In the propulsion frame, the wrench per unit thrust of a rotor is ``[d; p × d - s κ d]``, with position ``p``,
-    unit thrust direction ``d``, spin ``s`` and drag ratio ``κ``.  The result is in the base (root joint) frame about
-    its origin.  The model must be free-flying, with the propulsion frame on the base body.
+    unit thrust direction ``d``, spin ``s`` and drag ratio ``κ``.  The result is in the axes of the base frame (the
+    root joint), about the origin of this frame.  The model must be free-flying, with the propulsion frame on the base
+    body.
     """
     if not is_free_flyer(model):
         raise SpecError("rotors on a robot that cannot fly", where="propulsion", hint='set root = "free-flyer"')
@@ -222,7 +224,7 @@ def lateral_force_range(model: pin.Model, propulsion: PropulsionSpec, q: ArrayLi
 
 
 def _centred_thrusts(matrix: Array, wrench: Array, low: float, high: float) -> Array:
-    """Solve ``A f = w`` for the thrusts farthest from their limits, or else by least squares within the limits."""
+    """Solve ``A f = w`` for the thrusts farthest from their limits; without a solution, by bounded least squares."""
     count = matrix.shape[1]
     if count == 6 and np.linalg.matrix_rank(matrix) == 6:
         return np.asarray(np.linalg.solve(matrix, wrench))

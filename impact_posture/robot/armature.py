@@ -21,7 +21,7 @@ ArmatureOption = Mapping[str, float] | str | None
 def set_armature(model: pin.Model, spec: RobotSpec, srdf: Path | None, option: ArmatureOption, name: str) -> str:
     """Set ``model.armature``, kg·m² (kg for prismatic joints); return a description of the source of the values.
 
-    The source is the option, or else robot.toml, or else the rotor data of the SRDF, or else the MJCF, or else zero.
+    The first available source is used: the option, robot.toml, the rotor data of the SRDF, the MJCF, or zero.
 
     Raises:
         InputError: A joint does not exist, a value is below zero, or a file cannot be read.
@@ -53,7 +53,7 @@ def set_armature(model: pin.Model, spec: RobotSpec, srdf: Path | None, option: A
 
 
 def armature_warning(model: pin.Model, source: str, held: Sequence[str]) -> tuple[str, ...]:
-    """Return a warning about joints without armature, if there are any, except the joints ``held``."""
+    """Return a warning about joints without armature, except the joints ``held``; empty if there are none."""
     armature = np.asarray(model.armature)
     counted = {i: str(model.names[i]) for i in joint_range(model) if model.names[i] not in held}
     bare = [name for i, name in counted.items() if not (armature[v_slice(model, i)] > 0).any()]

@@ -86,7 +86,7 @@ def feet(robot: Robot, named: Sequence[str] = ()) -> tuple[str, ...]:
         excluded = (_WHEEL, _FINGER) if by_name else (_WHEEL, _FINGER, _ARM)
         if len(line) < 2 or not links or any(part.search(word) for part in excluded for word in words):
             continue
-        # Prefer the sole, or else the lowest link, because an ankle lies above its foot.
+        # Prefer the sole.  Without a sole, prefer the lowest link, because an ankle lies above its foot.
         best = min(by_name or links, key=lambda n: ("sole" not in n.lower(), round(height[n], 3), links.index(n)))
         (called_feet if by_name else others).append(best)
     if called_feet:
@@ -148,9 +148,9 @@ def wheels(robot: Robot) -> tuple[str, ...]:
 
 
 def propellers(robot: Robot) -> tuple[str, ...]:
-    """Return the links with a name like "rotor" or "prop" on the base, or on joints of the base, if there are three.
+    """Return at least three links on the base, or on joints of the base, with a name like "rotor" or "prop".
 
-    Legged robots have none, because their links of this name are the rotors of motors.
+    The result is empty for legged robots, because their links of this name are the rotors of motors.
     """
     model, base = robot.model, 1 if robot.floating else 0
     on_base = {base, *(i for i in joint_range(model) if model.parents[i] == base and not len(model.children[i]))}

@@ -13,9 +13,9 @@ from impact_posture.errors import InertiaError
 from impact_posture.robot.model_joints import v_slice
 from impact_posture.robot.robot import Robot
 
-# Masses (kg) and moments of inertia (kg m²) below this are treated as zero.
+# A mass (kg) or moment of inertia (kg m²) below this is treated as zero.
 _TINY = 1e-10
-# Products of larger entries of a mass matrix overflow.
+# Products of entries of a mass matrix overflow if the entries are larger than this.
 _LARGEST = 1e100
 # Relative violation of the triangle inequality that is treated as a rounding error.
 _TRIANGLE_SLACK = 1e-3
@@ -27,7 +27,7 @@ _SINGULAR = 1e-12
 def check_inertias(root: ET.Element, model: pin.Model, path: Path, accept: bool) -> tuple[str, ...]:
     """Raise an error for links with impossible masses or inertias; return warnings.
 
-    An error becomes a warning if ``accept`` is true, or if the error is negligible beside the inertia of the body
+    An error becomes a warning if ``accept`` is true, or if it is negligible compared with the inertia of the body
     that contains the link.
 
     Raises:

@@ -1,8 +1,8 @@
 """Coupled joints: a follower moves with its leader, like the fingers of a gripper with one motor.
 
-A configuration contains both joints, and ``q_follower = ratio · q_leader + offset``.  All generalized velocities
-have the form ``ν = C ν``, where the matrix ``C`` copies the leader's velocity, times the ratio, to the follower and
-ignores the follower's own entry.  ``C`` is a projector.  The dynamics of the coupled robot have the mass matrix
+A configuration contains both joints, and ``q_follower = ratio · q_leader + offset``.  All possible generalized
+velocities satisfy ``ν = C ν``.  The matrix ``C`` sets the velocity of the follower to the ratio times the velocity of
+the leader.  ``C`` is a projector.  The dynamics of the coupled robot have the mass matrix
 ``CᵀMC`` and the Jacobian ``JC``.  The motor of the leader exerts ``Cᵀτ``.
 """
 
@@ -54,9 +54,9 @@ def composed(stated: Mapping[str, JointCoupling], where: str) -> tuple[JointCoup
 def urdf_couplings(root: ET.Element, where: str) -> tuple[tuple[JointCoupling, ...], list[str]]:
     """Return the couplings that the ``<mimic>`` tags of a URDF state, and warnings about tags that state none.
 
-    The tags of coupled joints in ``root`` change.  Continuous joints become revolute joints without limits, because a
-    cosine and a sine do not count the full turns of a leader.  The limits of a joint become equal if it mimics a
-    fixed joint, or with the multiplier zero.
+    The function changes the tags of coupled joints in ``root``.  Continuous joints become revolute joints without
+    limits, because a cosine and a sine do not count the full turns of a leader.  The limits of a joint become equal
+    if it mimics a fixed joint, or if the multiplier is zero.
 
     Raises:
         UrdfError: Joints mimic each other in a circle, a planar or floating joint is coupled, or a number is invalid.

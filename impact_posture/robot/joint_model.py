@@ -2,8 +2,8 @@
 
 With a soft spring between rotor and link, a short impact ends before the rotor turns.  The inertia is then ``M``, the
 mass matrix of the links.  With a stiff transmission, the rotor moves with the link, and the inertia is ``M + B``,
-where ``B`` is the armature.  A joint that cannot be driven from its link does not move.  These cases are modeled by
-an armature of zero, of the rotor inertia, and of infinity.
+where ``B`` is the armature.  A joint that cannot be driven from its link does not move.  The armature in these three
+cases is zero, the reflected rotor inertia, and infinite.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ class Transmissions:
     """Transmission of each velocity entry, shape (nv,); a floating base has none.
 
     The rotor of a ``rigid`` joint moves with the link.  A ``locked`` joint cannot be driven from its link.
-    ``stiffness`` between rotor and link is in N·m/rad (N/m if prismatic), and infinite if robot.toml does not state
-    it.  ``damping`` acts in parallel with this spring, N·m·s/rad (N·s/m).
+    ``stiffness`` between rotor and link is in N·m/rad (N/m if prismatic).  It is infinite if robot.toml does not
+    state it.  ``damping`` acts in parallel with this spring, N·m·s/rad (N·s/m).
     """
 
     rigid: Mask

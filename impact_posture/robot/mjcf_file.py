@@ -22,26 +22,28 @@ from impact_posture.system.text_files import open_regular, read_bytes
 
 # Value of the compiler option ``inertiafromgeom`` with which geoms replace stated inertias.
 _FROM_GEOMS = 1
-# Root element after a declaration and comments, and the number of bytes in which it is searched.  Atomic groups keep
-# the search short in a file with many comments.  A file with the root ``mujocoinclude`` is a part of another file.
+# Pattern of the root element after a declaration and comments.  Atomic groups keep the search short in a file with
+# many comments.  A file with the root ``mujocoinclude`` is a part of another file.
 _ROOT = re.compile(
     rb"(?:\xef\xbb\xbf)?\s*(?>(?><\?.*?\?>|<!--.*?-->|<!DOCTYPE[^>]*>)\s*)*+<mujoco(?:include)?\b", re.S
 )
+# Number of bytes at the start of a file in which the root element is searched.
 _HEAD = 50_000
 # Largest number of bodies, of repetitions, and of rows or columns of a height field.  MuJoCo takes 2 s to read 10,000
-# bodies, and four times as long for twice as many.  It crashes if a height field does not fit into memory.
+# bodies, and four times as long for twice as many.  MuJoCo crashes if a height field does not fit into memory.
 _MOST = 5_000
 _COUNT = re.compile(rb"""\b(?:nrow|ncol|count)\s*=\s*["']\s*(\d{1,9})""")
 # Processor time of the compiler, s.  It needs 2 s for 10,000 bodies.
 _SECONDS = 30.0
 _UTF_16 = codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE
-# Fields of a compiled model that have to be finite, and fields of ranges, which may be infinite.
+# Fields of a compiled model that must be finite.
 _NUMBERS = (
     "qpos0", "body_pos", "body_quat", "body_ipos", "body_iquat", "jnt_pos", "jnt_axis", "dof_armature", "site_pos",
     "site_quat", "geom_pos", "geom_quat", "geom_size", "eq_data", "key_qpos", "actuator_gear", "actuator_armature",
     "gravity", "qpos_spring", "jnt_stiffness", "dof_damping", "dof_frictionloss", "geom_friction", "geom_solref",
     "geom_solimp", "geom_solmix", "geom_margin", "geom_gap",
 )  # fmt: skip
+# Fields of ranges, which may be infinite.
 _RANGES = ("jnt_range", "jnt_actfrcrange", "actuator_forcerange", "actuator_ctrlrange", "actuator_gainprm")
 
 
@@ -77,7 +79,7 @@ def read_mjcf(path: Path, root: Root | None) -> MjcfFile:
     """Compile an MJCF.  ``root`` adds or removes the free joint; ``None`` keeps the root of the file.
 
     Raises:
-        MjcfError: MuJoCo rejects the file, crashes, or takes too much time or memory, or the file couples joints by
+        MjcfError: MuJoCo rejects the file, crashes, or takes too much time or memory.  Or the file couples joints by
             loops, tendons or polynomials.
         InputError: MuJoCo is not installed.
     """
@@ -130,7 +132,7 @@ def drives_joint(model: Any, actuator: int) -> bool:
 
 
 def _compile(spec: Any, path: Path) -> tuple[Any, list[str]]:
-    """Compile a spec without textures and sensors, and without missing meshes if all inertias are stated."""
+    """Compile a spec without textures and sensors; if all inertias are stated, also without missing meshes."""
     for sensor in list(spec.sensors):  # Sensors of a robot may need geoms of its scene.
         spec.delete(sensor)
     for texture in spec.textures:
@@ -247,7 +249,7 @@ def _couplings(model: Any, path: Path) -> tuple[JointCoupling, ...]:
     """Return the couplings by equality constraints; raise an error for loops, polynomials and more than two joints.
 
     The constraint is ``q − q⁰ = a₀ + a₁ (q' − q'⁰) + …`` with the positions ``q⁰``, ``q'⁰`` in ``qpos0``.  A joint
-    that a constraint holds at a constant gets equal limits.
+    that a constraint holds at a constant position gets equal limits.
     """
     mujoco, couplings, followers = import_mujoco(), dict[str, JointCoupling](), set[int]()
     for k in map(int, np.flatnonzero(model.eq_active0)):
@@ -292,7 +294,7 @@ def _coupling_armatures(model: Any) -> Iterator[str]:
 
 
 def _left_out(model: Any) -> Iterator[str]:
-    """Yield one line that counts the parts of the file that the model of an impact leaves out; none without parts."""
+    """Yield one line that counts the parts of the file that the impact model leaves out, if there are any."""
     mujoco = import_mujoco()
     balls = (model.jnt_type == mujoco.mjtJoint.mjJNT_BALL) & (model.jnt_limited > 0)
     tendons = (model.tendon_stiffness > 0) | (model.tendon_limited > 0) | (model.tendon_damping > 0)

@@ -20,7 +20,7 @@ from impact_posture.system.arrays import Array
 from impact_posture.system.optional_package import import_mujoco
 
 ROOT_JOINT = "root_joint"
-# Pinocchio's limits of cosines, sines and quaternions.
+# Limit that Pinocchio sets for cosines, sines and entries of quaternions.
 _UNIT = 1.01
 
 
@@ -162,7 +162,7 @@ def _force(mjcf: Any, a: int) -> float:
 
 
 def _both_ways(interval: Array) -> float:
-    """Return the largest magnitude that a range allows in both directions; infinite for a one-sided range."""
+    """Return the largest magnitude that a range permits in both directions; infinite for a one-sided range."""
     return float(min(-interval[0], interval[1])) if interval[0] < 0 < interval[1] else np.inf
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from impact_posture.errors import JointNotFound, PostureError, degrees_hint
 
-# Larger limits count as missing.  Pinocchio writes "no limit" as the largest double.
+# A position limit larger than this counts as missing.  Pinocchio writes "no limit" as the largest double.
 ENDLESS = 1e10
 
 
@@ -74,7 +74,8 @@ def scalar_entries(model: pin.Model, index: int, value: float, where: str) -> tu
     """Return the entries in ``q`` of a joint with one degree of freedom: its value, or its cosine and sine.
 
     Raises:
-        PostureError: A continuous joint is at a whole number beyond two turns, which is an angle in degrees.
+        PostureError: The value of a continuous joint is a whole number beyond two turns, so it is probably in
+            degrees.
     """
     if model.nqs[index] == 1:
         return (value,)
@@ -111,7 +112,7 @@ def immovable_joints(model: pin.Model) -> list[str]:
 
 
 def rigid_groups(model: pin.Model, held: Sequence[str]) -> list[int]:
-    """Return the group number of each joint; links of one group are one body if the joints ``held`` do not move."""
+    """Return the group number of each joint; links of one group form one body while the ``held`` joints rest."""
     group = list(range(model.njoints))
     for joint in range(1, model.njoints):
         if model.names[joint] in held:

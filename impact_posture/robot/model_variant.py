@@ -31,7 +31,7 @@ class Payload:
 
 @dataclass(frozen=True, eq=False)
 class ModelVariant:
-    """A possible model of the robot, with a factor on the armature in robot.toml, and possibly a payload."""
+    """Possible model of the robot: a factor on the armature in robot.toml, and an optional payload."""
 
     name: str
     robot: Robot
@@ -116,7 +116,7 @@ def between(variants: Sequence[ModelVariant], count: int, seed: int) -> list[Rob
     payloads = [variant.payload for variant in variants if variant.payload is not None]
     robots = []
     for _ in range(count):
-        # Draw uniformly in the logarithm, in which the factors 1/2 and 2 are equally far from 1.
+        # Draw the logarithm of the factor uniformly, because the factors 1/2 and 2 are then equally far from 1.
         factor = float(np.exp(generator.uniform(np.log(min(factors)), np.log(max(factors)))))
         payload = None
         if payloads:

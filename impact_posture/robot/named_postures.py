@@ -22,7 +22,7 @@ def named_postures(
     """Return all named postures, shape (nq,) each, and the name of the default posture.
 
     Postures of ``robot.toml`` (``spec``) replace keyframes of the MJCF and ``group_state`` tags of the SRDF with the
-    same name.  The limits of the model must be final.
+    same name.  The caller must set the limits of the model before.
 
     Raises:
         UrdfError: The SRDF cannot be read.
@@ -62,7 +62,7 @@ def ignored_bases(spec: RobotSpec, srdf: Path | None, default: str) -> tuple[str
 
 
 def _neutral(described: RobotDescription) -> Array:
-    """Return the neutral configuration of a file; a value beyond a limit is replaced by this limit."""
+    """Return the neutral configuration of a file, with each value beyond a limit replaced by this limit."""
     model = described.model
     return np.asarray(np.clip(described.neutral, model.lowerPositionLimit, model.upperPositionLimit))
 

@@ -38,9 +38,9 @@ def read_posture(robot: Robot, text: str | Array | Sequence[float] | None, where
         robot: The robot.
         text: Name of a posture of the robot, or a file: ``posture.json`` (``q`` in the order of ``joint_names``),
             ``{"base": [x, y, z, qx, qy, qz, qw], "joints": {name: value}}``, or a ``sensor_msgs/JointState`` in YAML
-            (``name: [...]``, ``position: [...]``).  A continuous joint is given as an angle, rad.  Joints that the
-            file does not name stay as in the default posture.  ``None`` means the default posture.  A configuration,
-            shape (nq,), is only checked.
+            (``name: [...]``, ``position: [...]``).  The value of a continuous joint is an angle, rad.  Joints that
+            the file does not name stay as in the default posture.  ``None`` means the default posture.  If ``text``
+            is a configuration, shape (nq,), the function only checks it.
         where: Option or file, for error messages.
 
     Raises:

@@ -42,9 +42,10 @@ CONVENTION = (
 )
 FIXED_CONVENTION = "q = [joints]; v = [joint rates]; SI units, radians"
 
-# A joint that is beyond a position limit by less than this (rad, m) is treated as on the limit.
+# A joint that exceeds a position limit by less than this (rad, m) is treated as if it were at the limit.
 _ON_LIMIT = 1e-6
-# A follower may differ from its coupling by this (rad, m) in a posture, for example because of rounded numbers.
+# In a posture, a follower may deviate from the position that its leader requires by this (rad, m).  For example, the
+# numbers of the posture may be rounded.
 _COUPLED = 1e-3
 
 
@@ -92,7 +93,7 @@ class Robot:
     Attributes:
         name: Name in outputs.
         source: Path or ``example-robot-data:`` URI of the URDF or MJCF.
-        model: Model with armature, limits and locked joints as used; treat it as read-only.
+        model: Model with the final armature, limits and locked joints; treat it as read-only.
         root: ``free-flyer`` or ``fixed``.
         postures: Named configurations, shape (nq,).
         default_posture: Name of the posture to start from.
@@ -102,7 +103,7 @@ class Robot:
         warnings: Warnings about this model, one line each.
         joint_model: Model of the inertia at the joints (:func:`~impact_posture.robot.joint_model.with_joint_model`).
         stated_armature: Original armature, shape (nv,), if ``joint_model`` has changed ``model.armature``.
-        couplings: Couplings of joints, by which a follower moves with its leader.
+        couplings: Couplings of joints.  In each coupling, a follower moves with its leader.
         settings: Settings of :func:`~impact_posture.robot.robot_loader.load_robot`; ``None`` if another function made
             the robot.
         files: Files of the robot; ``None`` if another function made the robot.
@@ -200,7 +201,7 @@ class Robot:
 
     @cached_property
     def projector(self) -> Array:
-        """Projector onto the velocities that an impact can change: coupled, and zero at locked joints, (nv, nv)."""
+        """Projector onto the velocities that an impact can cause: coupled, zero at locked joints, shape (nv, nv)."""
         return np.asarray(self.coupling_matrix * np.isfinite(self.model.armature))
 
     @cached_property
@@ -277,7 +278,7 @@ class Robot:
         frames = list(enumerate(self.model.frames))
         links = [(i, frame.name) for i, frame in frames if frame.type == pin.FrameType.BODY]
         others = [(i, frame.name) for i, frame in frames if frame.name != "universe"]
-        # Of several frames with the same name, the first link is used, or else the first frame.
+        # Of several frames with the same name, use the first link.  Without a link, use the first frame.
         return {name: i for i, name in reversed([*links, *others])}
 
     @checked
@@ -346,7 +347,7 @@ class Robot:
         return coupled(self.model, self.couplings, q)
 
     def _check_coupled(self, q: Array, where: str) -> Array:
-        """Return ``q`` with exact positions of followers; raise an error if a position is clearly wrong."""
+        """Return ``q`` with exact positions of followers; raise an error if a position differs clearly."""
         exact = self.coupled(q)
         for c in self.couplings:
             index = self.model.idx_qs[self.model.getJointId(c.follower)]
@@ -369,7 +370,7 @@ class Robot:
                 raise PostureError(f"{what} has norm {norm:.4g}", where=where, hint=f"give a unit {kind}{order}")
 
     def _check_swapped(self, quaternion: Array, where: str) -> None:
-        """Raise an error if the base quaternion is clearly in the order w x y z."""
+        """Raise an error if the base quaternion seems to be in the order w x y z."""
         rotation = pin.Quaternion(*[float(quaternion[k]) for k in (3, 0, 1, 2)]).matrix()
         swapped = pin.Quaternion(*[float(v) for v in quaternion]).matrix()
         # The base is upside down in the order x y z w, but upright in the order w x y z.

@@ -1,6 +1,6 @@
 """Robots in the collections of other packages: MuJoCo Menagerie, and robot_descriptions.
 
-Both packages download the files of a robot on its first use, and keep them in a cache of their own.
+Both packages download the files of a robot when it is first used, and keep these files in their caches.
 """
 
 from __future__ import annotations

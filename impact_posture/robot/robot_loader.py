@@ -58,8 +58,8 @@ def load_robot(robot: str, options: LoadOptions | None = None, **settings: Any) 
     Args:
         robot: One of the forms of :func:`~impact_posture.robot.robot_collections.ways_to_name`.
         options: Options of loading.
-        settings: Fields of :class:`~impact_posture.config.problem_settings.LoadOptions` in place of ``options``, for
-            example ``root="fixed"``.
+        settings: Fields of :class:`~impact_posture.config.problem_settings.LoadOptions`, for example
+            ``root="fixed"``.  They replace ``options``.
 
     Raises:
         RobotNotFound: No robot has this name; the error lists the nearest names.
@@ -125,8 +125,8 @@ def names_a_path(robot: str, folder: Path) -> bool:
 def from_folder(data: dict[str, object], folder: Path, files: Sequence[str]) -> dict[str, object]:
     """Return a copy of ``data``, the content of a file in ``folder``, with relative paths resolved.
 
-    The key ``robot`` contains a name, a path or a URI, as on the command line.  The values of the keys ``files`` may
-    be paths.
+    The key ``robot`` contains a name, a path or a URI, as on the command line.  ``files`` are the other keys whose
+    values may be paths.
     """
     data = dict(data)
     for key in files:
@@ -265,7 +265,7 @@ def _override_limits(model: pin.Model, spec: RobotSpec, name: str) -> None:
 
 
 def _check_names(model: pin.Model, source: str) -> None:
-    """Raise an error if two joints or two links have the same name, which could select the wrong one."""
+    """Raise an error if two joints or two links have the same name, because the name could select the wrong one."""
     links = [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
     for kind, names in (("joints", list(model.names)), ("links", links)):
         name, count = Counter(names).most_common(1)[0] if names else ("", 0)
@@ -284,7 +284,7 @@ def _check_limits(model: pin.Model, source: str) -> None:
 
 
 def _beside(model: pin.Model) -> tuple[str, ...]:
-    """Return the joints of a floating robot that hang on the world, such as parts of the scene in an MJCF."""
+    """Return the joints of a floating robot whose parent is the world, such as parts of the scene in an MJCF."""
     return tuple(model.names[k] for k in range(2, model.njoints) if 1 not in model.supports[k])
 
 
@@ -298,7 +298,7 @@ def _immovable(model: pin.Model) -> list[str]:
 
 
 def _named(model: pin.Model, patterns: Sequence[str], where: str) -> tuple[str, ...]:
-    """Return the joints that names or patterns select, without repetition; each name has to select a joint."""
+    """Return the joints that names or patterns select, without repetition; each pattern must select a joint."""
     known = movable_joints(model)
     selected: dict[str, None] = {}
     for pattern in patterns:

@@ -149,7 +149,7 @@ class TransmissionSpec(_Table):
 
 @dataclass(frozen=True)
 class RotorSpec(_Table):
-    """A propeller: position, thrust direction, and direction of rotation (seen against the thrust)."""
+    """A propeller: position, thrust direction, and direction of rotation as seen against the thrust direction."""
 
     name: str
     position: Vector3
@@ -201,7 +201,7 @@ class RobotSpec(_Table):
 def read_spec(path: Path, over: Path | None = None) -> RobotSpec:
     """Read and check a ``robot.toml``.  The file ``over`` provides missing values.
 
-    If ``path`` names a URDF, it describes another robot, and ``over`` is ignored.
+    If the file ``path`` names a URDF, the file describes another robot, and ``over`` is ignored.
     """
     data = read_toml(path)
     model = data.get("model", {})

@@ -8,7 +8,8 @@ import numpy as np
 
 from impact_posture.system.arrays import Array, nonnegative_least_squares
 
-# A point within this distance (m) of a line counts as on the line.  Edges are rounded to this number of decimals.
+# A point within the distance ``_ROUNDING`` (m) of a line counts as on the line.  Edges are rounded to ``_DIGITS``
+# decimals.
 _ROUNDING, _DIGITS = 1e-9, 12
 
 

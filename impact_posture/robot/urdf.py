@@ -32,7 +32,7 @@ _DEEPEST = 1_000
 # A comment.  It may contain "--", which XML forbids and urdfdom accepts.
 # Without an end, it reaches to the end of the file.
 _COMMENT = re.compile(r"<!--.*?(?:-->|\Z)", re.DOTALL)
-# An ampersand that begins no entity, which XML forbids and urdfdom accepts.
+# An ampersand that does not begin an entity.  XML forbids this ampersand, and urdfdom accepts it.
 _LONE_AMPERSAND = re.compile(r"&(?!(?:amp|lt|gt|quot|apos|#\d+|#x[\da-fA-F]+);)")
 
 EXAMPLE_PREFIX = "example-robot-data:"
@@ -106,7 +106,7 @@ def build_model(
     couplings, lost = urdf_couplings(root, str(path))
     try:
         with quiet_stderr() as errors:
-            # The decoded text instead of the file, because urdfdom reads each file as UTF-8.
+            # Parse the decoded text instead of the file, because urdfdom reads each file as UTF-8.
             text = ET.tostring(root, encoding="unicode") if below_zero or couplings else text
             model = pin.buildModelFromXML(text, *([pin.JointModelFreeFlyer()] if free_flyer else []))
     except OSError:  # No file descriptor is left for quiet_stderr().
@@ -150,7 +150,7 @@ def _check_depth(root: ET.Element, path: Path) -> None:
 
 
 def _check_origins(root: ET.Element, path: Path) -> None:
-    """Raise an error for origins of joints, masses and shapes that are too far away to compute with."""
+    """Raise an error if the origin of a joint, mass or shape is farther away than :data:`FARTHEST`."""
     for owner in (*root.iter("link"), *root.iter("joint")):
         for origin in owner.iter("origin"):
             xyz = origin.get("xyz", "")
@@ -167,7 +167,7 @@ def parse_urdf(path: Path) -> ET.Element:
 def _read(path: Path) -> tuple[str, ET.Element]:
     """Return the text of a URDF without comments, and its root element.
 
-    All that urdfdom accepts is accepted: names with ``:``, any encoding, ``--`` in comments.
+    The function accepts everything that urdfdom accepts: names with ``:``, any encoding, ``--`` in comments.
 
     Raises:
         UrdfError: The file is missing, is not a URDF, or contains expressions or elements of xacro.
@@ -223,7 +223,7 @@ def _xml_text(path: Path) -> str:
 
 
 def _xacro_leftover(root: ET.Element) -> str:
-    """Return the first xacro element, or the first number that is a xacro expression; empty without both."""
+    """Return the first xacro element, or else the first number that is a xacro expression; empty without them."""
     for element in root:
         if element.tag.startswith("xacro:"):
             return f"<{element.tag}>"

@@ -44,7 +44,7 @@ class _Arguments(dict[str, str]):
 
 
 class _Packages:
-    """Folders of packages: from ``known`` by name, below ``folders``, below a folder above ``path``, or from ROS."""
+    """Folders of packages: in ``known`` by name, in one of ``folders``, in a folder above ``path``, or from ROS."""
 
     def __init__(self, path: Path, folders: Sequence[Path], known: Mapping[str, str]) -> None:
         self._path, self._places, self._known = path, [*folders, *path.absolute().parents], known
@@ -88,10 +88,10 @@ def expand_xacro(
 ) -> Path:
     """Expand a xacro file, and return the path of the URDF in the cache.
 
-    ``arguments`` replace the defaults of ``<xacro:arg>``.  A package in ``$(find PACKAGE)`` and in ``package://``
-    paths is in ``packages``, or has this name in one of the ``folders`` or in a folder above the file, or is a
-    package of ROS.  Relative paths of meshes start from the folder of the xacro file, or from the folder above it,
-    where expanded files often are.
+    ``arguments`` replace the defaults of ``<xacro:arg>``.  For a package in ``$(find PACKAGE)`` or in a
+    ``package://`` path, the function searches ``packages``, then ``folders``, then the folders above the file, then
+    ROS.  Relative paths of meshes start from the folder of the xacro file.  They may also start from the folder above
+    it, where expanded files often are.
 
     Raises:
         UrdfError: The file cannot be expanded, or this takes too much time or memory.

@@ -1,4 +1,4 @@
-"""Folder of a sweep: a manifest, and one Parquet file per shard (block of grid points that a worker solves)."""
+"""Folder of a sweep: a manifest, and one Parquet file per shard.  A worker solves a shard, a block of grid points."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class Atlas:
 
         Raises:
             OutputError: The folder contains other files, or results of another sweep or version, or another process
-                uses it.
+                uses the folder.
             SpecError: The manifest is too damaged to belong to a known sweep.
         """
         manifest, text = self.folder / MANIFEST, manifest_text(self._sweep, self._key)
@@ -168,7 +168,7 @@ class Atlas:
         return self.folder / place / shard_name(self._sweep, shard)
 
     def _read(self, shard: int, place: str = _DATA) -> tuple[int, bytes]:
-        """Return after how many passes a shard file was written, 0 if it cannot be used, and its content."""
+        """Return the number of passes after which a shard file was written (0: unusable), and the file content."""
         path, content, passes = self._path(shard, place), b"", 0
         with suppress(OSError):
             content = read_bytes(path)

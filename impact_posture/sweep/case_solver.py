@@ -24,9 +24,9 @@ from impact_posture.sweep.point_search import Place, Timer, Walk
 from impact_posture.sweep.sweep_file import OFFSETS, Case, Grid
 from impact_posture.system.arrays import Array
 
-# A worker keeps at least _KEPT problems and programs in memory, each about 1 MB.  If the speed varies, it keeps a
-# problem for each speed, but at most _MOST_SPEEDS.  Problems with other normals are removed first, because the normal
-# varies slowest.
+# A worker keeps at least ``_KEPT`` problems and programs in memory, each about 1 MB.  If the speed varies, the worker
+# keeps a problem for each speed, but at most ``_MOST_SPEEDS``.  Problems with other normals are removed first,
+# because the normal varies slowest.
 _KEPT, _MOST_SPEEDS = 4, 64
 
 _Value = TypeVar("_Value")
@@ -60,8 +60,8 @@ class CaseSolver:
     def normal_and_speed(self, values: Mapping[str, Any]) -> tuple[Any, float]:
         """Return normal and speed for ``values`` of the grid axes; with the target, they determine the problem."""
         settings = self._case.settings
-        # A speed of the problem can select the objective and require the approach speed.  A speed of the grid must
-        # not.
+        # A speed of the problem can select the objective and require the approach speed.  A speed of the grid must do
+        # neither.
         speed = Unstated(values["speed"]) if "speed" in values else settings.speed
         return values.get("normal", settings.normal), speed
 
@@ -108,8 +108,8 @@ class CaseSolver:
     def walk(self, template: ConstrainedProblem) -> Walk:
         """Return the :class:`Walk` that solves points of a shard, starting from the problem ``template``.
 
-        A nonlinear program with the same expressions is reused.  Each walk extends its own copy of the program, so
-        its rounding errors do not depend on shards that this process solved before.
+        A nonlinear program with the same expressions is reused.  Each walk extends its own copy of the program.
+        Therefore, the rounding errors of a walk do not depend on shards that this process solved before.
         """
         key = f"{template.objective.structure}\n{template.structure}"
         built = kept(self._programs, key, lambda: build_nlp(template, compile="never"), _KEPT)

@@ -14,7 +14,8 @@ from typing import Any
 from impact_posture.errors import InputError
 from impact_posture.system.optional_package import import_extra
 
-# Time within which a Dask scheduler must answer, and time in which it can be told that the client leaves, s.
+# A Dask scheduler must answer within ``_LONGEST_SILENCE`` (s).  A client that leaves tries for ``_LEAVING`` (s) to
+# tell the scheduler.
 _LONGEST_SILENCE, _LEAVING = 30, 5
 
 
@@ -66,7 +67,7 @@ def dask_cluster(address: str) -> Iterator[Executor]:
 
 @contextmanager
 def _unlogged(*names: str) -> Iterator[None]:
-    """Hide the log messages of other packages, because the errors in these messages are also raised."""
+    """Hide the log messages of other packages, because these packages also raise the errors in the messages."""
     loggers = [logging.getLogger(name) for name in names]
     levels = [logger.level for logger in loggers]
     for logger in loggers:
@@ -140,7 +141,7 @@ class SlurmJobs(Executor):
         return [self._waiting.submit(job.result) for job in jobs]
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Stop the threads that wait for jobs, as :meth:`concurrent.futures.Executor.shutdown`.  Jobs continue."""
+        """Stop the threads that wait for jobs (:meth:`concurrent.futures.Executor.shutdown`).  The jobs continue."""
         self._waiting.shutdown(wait=wait, cancel_futures=cancel_futures)
 
 

@@ -30,7 +30,7 @@ from impact_posture.system.arrays import Array
 from impact_posture.system.escape import plot_label
 from impact_posture.system.output_folder import added_files
 
-# Two neighboring points count as different optima if their postures differ by more than SWITCH and by more than this
+# Two neighboring points count as different optima if the difference of their postures exceeds SWITCH and this
 # multiple of the lower quartile of all differences.  The lower quartile estimates the difference between neighbors
 # with the same optimum.  A difference is a norm in the tangent space, without the position of the base.
 _UNUSUAL = 4.0
@@ -76,8 +76,8 @@ def draw_maps(
     """Draw a map for each case of a sweep folder and write it into ``out``.  The sweep may be unfinished.
 
     ``axes`` contains the names of the horizontal and the vertical axis, by default the two axes with the most values.
-    The map shows the points at which the other axes have their middle values.  With ``force``, files of the user in
-    ``out`` that have the name of a map are replaced.
+    The map shows the points at which the other axes have their middle values.  With ``force``, a map replaces a file
+    of the user with the same name in ``out``.
 
     Raises:
         InputError: An axis is unknown.

@@ -23,8 +23,8 @@ from impact_posture.posture.search.growing_search import HIGH_PRICE
 from impact_posture.posture.search.multistart import distinct, solve
 from impact_posture.system.arrays import Array
 
-# Maximum number of rounds that add missing body pairs to the nonlinear program of a point.  ``_UNSURE`` applies as
-# long as it is unknown whether the point is feasible.
+# ``_ROUNDS`` is the maximum number of rounds that add missing body pairs to the nonlinear program of a point.  While
+# it is unknown whether the point is feasible, the maximum is ``_UNSURE``.
 _ROUNDS, _UNSURE = 8, 3
 # Postures whose joints differ by more than this (rad, m) may belong to different optima.
 SWITCH = 0.2
@@ -36,7 +36,7 @@ Place = tuple[Any, Any]
 
 
 class Start(NamedTuple):
-    """Start posture ``q``, shape (nq,), and the final solver state ``end`` at this posture; ``None`` if unknown."""
+    """Start posture ``q``, shape (nq,), and the final solver state ``end`` at ``q`` (``None`` if it is unknown)."""
 
     q: Array
     end: WarmStart | None = None
@@ -63,7 +63,7 @@ class PointResult(NamedTuple):
 
 @dataclass
 class Timer:
-    """Wall time in IPOPT and in the functions that IPOPT calls, s."""
+    """Timer of the wall time in IPOPT and in the functions that IPOPT calls, s."""
 
     solver_s: float = 0.0
 
@@ -154,9 +154,9 @@ class _Attempt:
     ) -> PointResult | None:
         """Return the best certified result, or ``None``.
 
-        With ``alone``, the runs start only from ``guesses``.  Otherwise, they also start from the given posture, and
-        from random starts if the results differ.  After each of at most ``rounds`` rounds, the program gets the body
-        pairs that violate their clearance at the results.
+        With ``alone``, the runs start only from ``guesses``.  Otherwise, they also start from the given posture.  If
+        the results differ, random starts are added.  After each of at most ``rounds`` rounds, the program gets the
+        body pairs that violate their clearance at the results.
         """
         price = SLACK_PRICE
         for _ in range(rounds):
@@ -181,8 +181,8 @@ class _Attempt:
             if self.problem is not problem:
                 self._walk.grow(self.problem)
             elif price == SLACK_PRICE:
-                # The program contains all violated body pairs, but a constraint is still violated: the solver is in a
-                # local minimum of the violation.  Try again with a higher penalty on violations.
+                # The program contains all violated body pairs, but a constraint is still violated.  The solver is
+                # therefore in a local minimum of the violation.  Try again with a higher penalty on violations.
                 price = HIGH_PRICE
             else:
                 return None

@@ -111,7 +111,7 @@ class _Shard:
         self._share()
 
     def revise(self, beside: Mapping[int, list[float]]) -> None:
-        """Improve border points from postures of other shards, then interior points from improved neighbors."""
+        """Improve border points from postures in other shards, then interior points from improved neighbors."""
         improved = set[int]()
 
         def improve_from_neighbors(points: Iterable[int], starts: Callable[[int], Start | None]) -> None:
@@ -171,7 +171,7 @@ class _Shard:
 
     def _share(self) -> None:
         """Copy the result of a point to the next points if they have the same problem."""
-        # Among points with the same problem, the first point was started from the most neighbors.
+        # Copy from the first of the points with the same problem, because it was started from the most neighbors.
         for point, is_new in self._problems():
             if not is_new:
                 index = point - self._points.start

@@ -83,7 +83,7 @@ def read_postures(content: bytes) -> list[list[float] | None]:
 
 
 def passes_of(content: bytes, key: str, name: str) -> int:
-    """Return after how many passes a shard file was written, 1 or 2.
+    """Return the number of passes, 1 or 2, after which a shard file was written.
 
     The result is 0 if the file is damaged, or is not the shard ``name`` of the sweep ``key``.
     """
@@ -92,7 +92,7 @@ def passes_of(content: bytes, key: str, name: str) -> int:
 
 
 def origin_of(content: bytes, name: str) -> tuple[str, int]:
-    """Return the key of the sweep of a shard file, and after how many passes it was written, 1 or 2.
+    """Return the key of the sweep of a shard file, and the number of passes, 1 or 2, after which it was written.
 
     The result is ``("", 0)`` if the file is damaged, or is not the shard ``name`` of a sweep.
     """

@@ -30,8 +30,8 @@ _NO_AXIS = ("schema", "q", "starts", "seed", "tradeoff", "tradeoff_against", "pa
 _FILES = ("srdf", "config", "weights", "armature", "posture")
 # Maximum number of points of a grid, so that every index is a 64-bit integer.
 _MOST = 10**15
-# Maximum number of combinations of values that need separate programs.  The settings of all combinations are in
-# memory.
+# Maximum number of combinations of values that need separate programs, because the settings of all combinations are
+# in memory.
 _MOST_CASES = 10**5
 # Number of neighbors from which a point is warm started, chosen along the fastest axes.
 _NEIGHBORS = 2
@@ -165,7 +165,7 @@ class Sweep:
         return case, range(first, min(first + self.shard, self.grid.size))
 
     def beside(self, shard: int) -> dict[int, list[int]]:
-        """Return the grid points in other shards that are next to this shard: number of the shard → its points."""
+        """Return the grid points beside a shard: number of the other shard → points of the other shard."""
         case, points = self.span(shard)
         neighbors: dict[int, list[int]] = {}
         for other in sorted({other for point in points for other in self.grid.around(point)}.difference(points)):

@@ -17,7 +17,7 @@ from impact_posture.system.text_files import read_text
 from impact_posture.version import __version__
 
 MANIFEST = "manifest.json"
-# Folders of schema 1 contain no checksums.
+# ``_UNSEALED`` is the schema of folders without checksums.  ``_SCHEMA`` is the schema of new folders.
 _UNSEALED, _SCHEMA = "impact-posture/sweep-folder/1", "impact-posture/sweep-folder/2"
 
 _Values = tuple[Finite, ...] | tuple[tuple[Finite, ...], ...]

@@ -16,7 +16,7 @@ from impact_posture.sweep.sweep_file import Sweep
 from impact_posture.system.optional_package import import_extra
 
 Progress = Callable[[int, int], None]
-# Maximum number of shards that are submitted and not yet written.  A larger number needs more memory.  With a smaller
+# Maximum number of shards that are submitted and not yet written.  A larger number takes more memory.  With a smaller
 # number, workers may have to wait for the next shard.
 IN_HAND = 64
 # Time after which an executor is checked if no shard was finished, s.
@@ -36,8 +36,8 @@ class SweepRun:
         shards: Number of shards that this run finished.
         solver_s: Sum of the wall times that the workers spent in IPOPT, s.
         total_s: Sum of the wall times of all shards, s.
-        damaged: Files that were damaged or of another sweep, as paths below the folder.  They were replaced if they
-            were needed.
+        damaged: Files that were damaged or belonged to another sweep, as paths below the folder.  The run replaced
+            the files that it needed.
     """
 
     folder: Path

@@ -17,7 +17,7 @@ def null_space(rows: Array, tolerance: float) -> Array:
 
 
 def independent_rows(rows: Array, tolerance: float) -> list[int]:
-    """Return the indices of a row basis of a matrix, shape (k, n), by pivoted Gram-Schmidt.
+    """Return the indices of independent rows of a matrix, shape (k, n), by pivoted Gram-Schmidt.
 
     A row is dependent if its distance from the span of the chosen rows is at most ``tolerance``.
     """
@@ -50,8 +50,7 @@ def nonnegative_least_squares(matrix: Array, right: Array) -> Array:
             break
         passive[slope.argmax()] = True
         while (trial := _unbounded(matrix, right, passive))[passive].min(initial=np.inf) <= 0:
-            # Move towards the trial solution until the first entry becomes zero.  The entry that became zero stays
-            # zero.
+            # Move towards the trial solution until the first entry becomes zero.  This entry then stays zero.
             falling = passive & (trial <= 0)
             step = (x[falling] / np.maximum(x[falling] - trial[falling], np.finfo(float).tiny)).min()
             x += step * (trial - x)

@@ -14,8 +14,8 @@ from impact_posture.errors import is_visible, printable
 
 # ASCII replacements for symbols in our texts, because some compilers reject other characters in C comments.
 _ASCII = str.maketrans({"·": " ", "²": "^2", "×": "x", "λ": "l", "ε": "eps", "⁻": "^-", "¹": "1"})
-# Largest numbers of characters in an identifier, a file name and a label.  Linkers and file systems accept more (255
-# bytes per file name), so suffixes can be added.
+# Largest numbers of characters in an identifier, a file name and a label.  Linkers and file systems accept longer
+# names (255 bytes per file name), so the program can add suffixes.
 _LONGEST_IDENTIFIER, _LONGEST_FILE_NAME, _LONGEST_LABEL = 100, 120, 60
 
 
@@ -42,8 +42,8 @@ def toml(value: object) -> str:
     """Return a value as TOML on one line.
 
     Raises:
-        UnicodeEncodeError: A text contains a lone surrogate, which TOML forbids.  Python reads paths that are not
-            UTF-8 as such texts.
+        UnicodeEncodeError: A text contains a lone surrogate, which TOML forbids.  Python uses lone surrogates in
+            paths that are not UTF-8.
     """
     if is_dataclass(value) and not isinstance(value, type):
         value = {key: item for key, item in asdict(value).items() if item is not None}
@@ -60,7 +60,7 @@ def toml(value: object) -> str:
 
 
 def xml_name(text: str) -> str:
-    """Return a name that is valid in XML, and not empty because MuJoCo cannot look up empty names."""
+    """Return a name that is valid in XML.  The name is not empty, because MuJoCo cannot look up empty names."""
     return printable(text) or "(empty)"
 
 

@@ -1,8 +1,8 @@
 """Record of the files that this program wrote into a folder, with their SHA-256.
 
 The record is the file ``.impact-posture.json`` in the folder.  A file is foreign if the record does not list it, and
-changed if its SHA-256 differs from the record.  Records of version 0.2 contain no SHA-256.  For these records, each
-listed file counts as unchanged, because changes cannot be detected.
+changed if its SHA-256 differs from the record.  Records of version 0.2 contain no SHA-256.  Their files count as
+unchanged, because changes cannot be detected.
 """
 
 from __future__ import annotations
@@ -111,8 +111,8 @@ def changed_files(folder: Path) -> list[str]:
 def is_own(folder: Path, name: str, path: Path | None = None) -> bool:
     """Return whether this program wrote the file ``name`` into a folder, and nobody changed the file since then.
 
-    ``path`` is where the file is now, by default ``folder / name``.  A subfolder may have a record too, and may be
-    newer than the record of the folder.  For example, ``c/`` in a result is an export.  Therefore both records count.
+    ``path`` is the present path of the file, by default ``folder / name``.  A subfolder may have a newer record than
+    the folder.  For example, ``c/`` in a result is an export.  Therefore both records count.
     """
     path = path or folder / name
     if not stat.S_ISREG(path.lstat().st_mode):

@@ -20,12 +20,13 @@ _Result = TypeVar("_Result")
 
 # Memory that the calls may allocate, bytes: 1.5 times the memory for the largest mesh file.
 MOST_MEMORY = 3 << 30
-# A call that sleeps this long, s, waits for a pipe or a device.  Waiting for a disk is not sleep, except for FUSE.
+# A call that sleeps this long, s, waits for a pipe or a device.  A process that waits for a disk does not sleep,
+# except with FUSE.
 _LONGEST_SLEEP = 1.0
-# Function of Linux in which a process sleeps while it waits for a file system of FUSE, such as sshfs.
+# Linux function in which a process sleeps while it waits for a file system of FUSE, such as sshfs.
 _FUSE = "request_wait_answer"
 _TOO_LARGE = "takes too much memory to read"
-# Time between two looks at a call, s.
+# Time between two checks of a running call, s.
 _PAUSE = 0.2
 
 
@@ -38,7 +39,7 @@ class CallTimedOut(CallFailed):
 
 
 class _Outcome(NamedTuple, Generic[_Result]):
-    """Result or exception of a call, and whether the copy should not make another call, for lack of memory."""
+    """Result or exception of a call, and whether the copy lacks memory for another call."""
 
     result: _Result | Exception
     last: bool
@@ -50,8 +51,9 @@ def isolated_calls(
     """Yield ``function(item)`` for each item, or the exception of the call.
 
     The calls run one after the other in a copy of this process, and their error output is discarded.  If a call ends
-    the copy, a new copy continues with the next item.  A call may use ``seconds(item)`` of processor time, and all
-    calls :data:`MOST_MEMORY`.  The signal handlers of this process run while a call waits for a file.
+    the copy, a new copy continues with the next item.  Each call may use ``seconds(item)`` of processor time, and all
+    calls together may use :data:`MOST_MEMORY`.  The signal handlers of this process run while a call waits for a
+    file.
 
     Raises:
         ImpactPostureError: The system cannot start a process.
@@ -132,9 +134,9 @@ def _received(copy: Copy[_Outcome[_Result]], seconds: float) -> _Outcome[_Result
 
 
 def _activity(pid: int | None) -> tuple[bool, int]:
-    """Return whether a process sleeps, but not for a disk, and its processor time in clock ticks.
+    """Return whether a process sleeps, but not for a disk, and the processor time of the process in clock ticks.
 
-    The result is ``(False, 0)`` unless on Linux.
+    On systems other than Linux, the result is ``(False, 0)``.
     """
     process = Path(f"/proc/{pid}")
     try:
@@ -147,7 +149,7 @@ def _activity(pid: int | None) -> tuple[bool, int]:
 
 
 def _memory() -> int:
-    """Return the address space of this process, bytes; 0 unless on Linux, because only Linux limits it."""
+    """Return the address space of this process, bytes; 0 on other systems than Linux, which do not limit it."""
     try:
         return int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[0]) * resource.getpagesize()
     except OSError:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 # Largest size of the arrays in a file, bytes: enough for a run of an hour at 1 kHz.
 MOST_BYTES = 1 << 32
-# Squares of larger numbers overflow.
+# Largest magnitude of a number in a file, because squares of larger numbers overflow.
 _LARGEST = 1e100
 
 
@@ -56,7 +56,7 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
 def fitting_arrays(
     arrays: Mapping[str, NDArray[Any]], prefix: str, shapes: Mapping[str, str], **sizes: int
 ) -> dict[str, NDArray[Any]]:
-    """Return the arrays that ``shapes`` names without their ``prefix``, after a check that they fit each other.
+    """Return the arrays named in ``shapes``, without their ``prefix``, after a check that their shapes agree.
 
     Args:
         arrays: Arrays of a file.

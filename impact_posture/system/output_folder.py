@@ -136,7 +136,7 @@ def added_files(folder: Path, *, force: bool) -> Iterator[Path]:
 
 
 def _unwritable(out: Path, error: OSError, hint: str) -> OutputError:
-    """Return the error for a folder that cannot be written; it names a file outside the folder that is the cause."""
+    """Return the error for a folder that cannot be written.  The error names the cause if this is another file."""
     cause = Path(os.fsdecode(error.filename)) if isinstance(error.filename, str | bytes) else out
     whole = out.absolute()
     inside = whole in (cause, *cause.parents) or cause == whole.parent
@@ -260,7 +260,7 @@ def _replace(beside: Path, out: Path, force: bool, kind: Kind) -> None:
     old = out.with_name(f"{out.name}.old-{secrets.token_hex(4)}")
     os.rename(out, old)
     try:
-        # Check again: since the rename, no other process writes into the old folder.
+        # Check again, because after the rename no other process writes into the old folder.
         if any(old.iterdir()):
             _check_ours(old, kind)
         os.rename(beside, out)
@@ -287,7 +287,7 @@ def used_alone(folder: Path, lock: Path) -> Iterator[None]:
             hint = "wait until it ends, or choose another folder"
             raise OutputError("is in use by another command", where=str(folder), hint=hint) from None
         except OSError:
-            # Some file systems do not support locks.  On them, the folder is not locked.
+            # Some file systems do not support locks.  Folders on these file systems are not locked.
             pass
         yield
     finally:

@@ -20,7 +20,7 @@ _Result = TypeVar("_Result")
 # Signals by which a user or the system ends a process.  A closed terminal sends SIGHUP.
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
-# Forked workers read the function here, because its objects (a CasADi solver) cannot be sent to another process.
+# Forked workers read their function here, because a function with a CasADi solver cannot be sent to another process.
 _WORK: dict[str, Callable[[int], Any]] = {}
 
 # Functions to call when a process ends early.  Each entry has the id of the process that added it, because a fork
@@ -83,7 +83,7 @@ def end_early(leave: Callable[[], None]) -> None:
 
 
 def _end(children: Sequence[BaseProcess]) -> None:
-    """Terminate processes, and kill those that still run after a second each."""
+    """Terminate processes.  Kill a process that still runs after one second."""
     for child in children:
         child.terminate()
     for child in children:
@@ -119,9 +119,9 @@ def process_pool(workers: int) -> Iterator[Executor]:
 def fork_map(function: Callable[[int], _Result], count: int, jobs: int) -> Iterator[Iterator[tuple[int, _Result]]]:
     """Yield ``(index, function(index))`` for each index below ``count``, in the order in which the calls finish.
 
-    The calls run in forked processes if ``jobs`` is more than one and the system can fork, else in this process, one
-    after the other.  All workers end with the block, also after Ctrl-C. On Linux, all workers also end if this
-    process is killed.
+    The calls run in forked processes if ``jobs`` is more than one and the system can fork.  Otherwise, they run in
+    this process, one after the other.  All workers end with the block, also after Ctrl-C.  On Linux, all workers also
+    end if this process is killed.
 
     Raises:
         WorkerDied: A worker was killed, for example for lack of memory.
@@ -215,7 +215,7 @@ def _copy(results: Callable[[], Iterator[Any]], receiver: Any, sender: Any, pare
 
 
 def depend(parent: int) -> None:
-    """Make a forked process end with its parent, and ignore signals except SIGTERM, with which pools end workers."""
+    """Make a forked process end with its parent, and ignore signals except SIGTERM, because SIGTERM ends workers."""
     for number in ENDING:
         signal.signal(number, signal.SIG_DFL if number == signal.SIGTERM else signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING)

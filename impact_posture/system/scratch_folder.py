@@ -1,7 +1,8 @@
 """Temporary folders that are removed even if the process that made them was killed.
 
 A process locks the file ``.impact-posture.json``, called the record, in its temporary folder.  An unlocked record
-means that the process was killed.  The next process that makes a temporary folder beside it removes the folder.
+means that the process was killed.  The next process that makes a temporary folder in the same place removes the old
+folder.
 """
 
 from __future__ import annotations
@@ -37,8 +38,8 @@ def made_by() -> dict[str, str]:
 def scratch_folder(parent: Path | None = None, mode: int = 0o700) -> Iterator[Path]:
     """Yield a temporary folder, which is removed after the block and after a signal.
 
-    The folder is made in ``parent``, by default in the temporary folder of the system.  By default, only the user can
-    read it.
+    The folder is made in ``parent``, by default in the temporary folder of the system.  With the default ``mode``,
+    only the user can read the folder.
 
     Raises:
         OutputError: The system has no temporary folder.

@@ -10,7 +10,7 @@ UNSEALED = _MARK.decode() + "0" * _DIGITS
 
 
 def sealed(content: bytes) -> bytes:
-    """Return the content of a file with the SHA-256 of its other bytes behind its last ``sha256:``."""
+    """Insert the SHA-256 of all other bytes of a file after its last ``sha256:``, and return the new content."""
     begin, digest = _digest(content)
     return content[:begin] + digest + content[begin + _DIGITS :]
 
@@ -22,7 +22,7 @@ def is_intact(content: bytes) -> bool:
 
 
 def sealed_text(text: str) -> str:
-    """Return a text behind a line with its SHA-256."""
+    """Return a text after a first line with the SHA-256 of the text."""
     return f"{sha256(text.encode()).hexdigest()}\n{text}"
 
 

@@ -21,10 +21,11 @@ from impact_posture.system.arrays import Array
 from impact_posture.system.libraries import build_library, load_library
 from impact_posture.system.scratch_folder import scratch_folder
 
-# First step of the finite differences, and number of steps.  Each step is half as long as the previous step.
+# ``_FIRST_STEP`` is the first step of the finite differences, rad (m), and ``_LEVELS`` is the number of steps.  Each
+# step is half as long as the previous step.
 _FIRST_STEP, _LEVELS = 0.02, 7
-# H, G and ∇H are zero if the contact cannot move along n.  So the scale of their relative errors is at least this
-# share of the largest H or G over all normals.
+# The scale of the relative errors of H, G and ∇H is at least this share of the largest H or G over all normals.
+# Without it, the scale would be zero if the contact cannot move along n.
 _FLOOR = 1e-3
 
 
@@ -73,8 +74,8 @@ class Numbers:
     """Quantities that one source computes at one sample: some of ``H``, ``G``, ``Λ_c``, ``∇H``, ``M`` and ``J``.
 
     Attributes:
-        values: Name of the quantity → its value.
-        scales: Name of the quantity → smallest denominator of its relative error.  A larger entry of the quantity
+        values: Name of the quantity → value.
+        scales: Name of the quantity → smallest denominator of the relative error.  A larger entry of the quantity
             replaces this denominator.
     """
 
@@ -192,8 +193,8 @@ def difference_gradient(value: Callable[[Array], float], model: pin.Model, q: Ar
     """Return ``d/dε value(q ⊕ ε e_i)``, shape (nv,), by Ridders' extrapolation of central differences.
 
     For each entry, the result is the extrapolated value that differs least from its neighbors in the extrapolation
-    table.  So the step needs no tuning (Ridders 1982, "Accurate computation of F'(x) and F'(x)F''(x)").  ``model``
-    defines ``⊕``.
+    table.  Therefore, the step needs no tuning (Ridders 1982, "Accurate computation of F'(x) and F'(x)F''(x)").
+    ``model`` defines ``⊕``.
     """
     directions = np.eye(model.nv)
 

@@ -36,9 +36,10 @@ REFERENCE = "Pinocchio"
 CASADI, COMPILED, DIFFERENCES, MUJOCO = "CasADi", "compiled C", "finite differences", "MuJoCo"
 NO_COMPILER = f"no C compiler: {GET_ONE}"
 
-# Largest relative errors that pass: for M and J; for H, G, Λ_c and analytic gradients; for finite differences.
+# Largest relative errors that pass.  ``_MODEL`` is for M and J.  ``_VALUES`` is for H, G, Λ_c and analytic gradients.
+# ``_DIFFERENCES`` is for finite differences.
 _MODEL, _VALUES, _DIFFERENCES = 1e-9, 1e-9, 1e-8
-# For standing robots, these errors replace _VALUES and _DIFFERENCES.  These errors are larger, because the condition
+# For standing robots, these errors replace ``_VALUES`` and ``_DIFFERENCES``.  They are larger, because the condition
 # number of the linear system is about 1/ε, where ε is the compliance of the supports.
 _ON_FEET = 1e-7, 1e-6
 
@@ -119,8 +120,8 @@ def verify(
     ``H``, and ``∇H`` by finite differences.
 
     The error of a quantity is relative to its largest entry.  ``H``, ``G`` and ``∇H`` are zero if the contact cannot
-    move along the normal.  So the denominator of their errors is at least a thousandth of the largest entry of
-    ``Λ_c`` (for ``G``: of ``JM⁻¹Jᵀ``).
+    move along the normal.  Therefore, the denominator of the errors of ``H`` and ``∇H`` is at least a thousandth of
+    the largest entry of ``Λ_c``.  For ``G``, it is at least a thousandth of the largest entry of ``JM⁻¹Jᵀ``.
 
     Args:
         objective: Objective with the robot, contact, metric and supports.
