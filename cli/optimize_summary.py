@@ -171,8 +171,9 @@ def _path(page: Page, path: dict[str, Any]) -> None:
         if strike["hindrance"]:
             page.line(f"  {number(strike['stated_speed'])} m/s is not possible, because of {strike['hindrance']}")
         after = strike["follow_through"]
+        stops = f"then stops within {number(after['longest_s'])} s after {after['stopped']}"
         page.line(
-            f"  then stops within {number(after['longest_s'])} s after {after['stopped']} of {after['impacts']} "
+            f"  {stops if after['stopped'] else 'cannot stop after any'} of {after['impacts']} "
             f"considered impacts (restitution {RESTITUTIONS[0]:g} to {RESTITUTIONS[-1]:g}, "
             f"{FACTORS[0]:.0%} to {FACTORS[-1]:.0%} of the speed)"
         )

@@ -17,6 +17,7 @@ from impact_posture.path.path_timing import LimitUse
 from impact_posture.path.posture_path import PosturePath
 from impact_posture.path.row_interpolation import INTERPOLATION, RowInterpolation
 from impact_posture.path.strike import Strike
+from impact_posture.path.time_law import DIGITS
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 from impact_posture.system.npz_files import read_arrays
@@ -27,6 +28,10 @@ _BLOCK = ("found", "reason", "method", "timing", "objective", "length", "max_vio
 _BASE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 # Larger numbers cannot be part of a path.
 _LARGEST = 1e9
+# The times of rows have 9 decimals, so two rows cannot be nearer to each other, s.
+_SHORTEST = 0.5 * 10.0**-DIGITS
+# Numbers of a strike in result.json.
+_STRIKE = ("speed", "stated_speed", "run_up_s", "run_up_m", "contact_s", "share")
 
 
 def write_path(folder: Path, robot: Robot, path: PosturePath) -> None:
@@ -88,7 +93,7 @@ def read_path(folder: Path, block: Mapping[str, Any], robot: Robot) -> PosturePa
         **{key: block[key] for key in _BLOCK},
         use=LimitUse(**shares, largest=block["limits"]) if shares else None,
         objectives=arrays["objective"],
-        strike=_read_strike(folder, block["strike"], robot) if "strike" in block else None,
+        strike=_read_strike(folder, block["strike"], rows, robot) if "strike" in block else None,
     )  # fmt: skip
 
 
@@ -102,20 +107,27 @@ def _read_rows(file: Path, robot: Robot) -> tuple[RowInterpolation, dict[str, Ar
         finite = key in ("share_torque", "share_thrust") or np.isfinite(arrays[key]).all()
         if arrays[key].shape != shape or not finite or (np.abs(arrays[key]) > _LARGEST).any():
             raise ValueError(f"'{key}' of {file.name} does not fit the path of {robot.name}")
-    if count == 0 or (np.diff(arrays["t"]) <= 0).any():
-        raise ValueError(f"the times of {file.name} do not increase")
+    if count == 0 or arrays["t"][0] != 0 or (np.diff(arrays["t"]) < _SHORTEST).any():
+        raise ValueError(f"the times of {file.name} do not increase from 0")
     return RowInterpolation(robot.model, *(arrays[key] for key in "tqva")), arrays
 
 
-def _read_strike(folder: Path, block: Mapping[str, Any], robot: Robot) -> Strike:
+def _read_strike(folder: Path, block: Mapping[str, Any], path: RowInterpolation, robot: Robot) -> Strike:
     """Return the strike of a path from its block in ``result.json`` and ``follow_through.npz``."""
+    numbers = np.array([block[key] for key in _STRIKE])
+    known = numbers.dtype == float and np.isfinite(numbers).all() and (numbers >= 0).all() and block["speed"] > 0
+    if not known or not block["run_up_s"] < block["contact_s"] == path.t[-1]:
+        raise ValueError(f"speed and times of the strike do not fit the path of {robot.name}")
     after = {key: value for key, value in block["follow_through"].items() if key != "duration_s"}
     velocities = [np.array(part["velocity"], dtype=float) for part in (block, after)]
-    if not all(v.shape == (robot.nv,) and np.isfinite(v).all() for v in velocities):
+    same = np.array_equal(velocities[0], path.v[-1])
+    if not same or velocities[1].shape != (robot.nv,) or not np.isfinite(velocities[1]).all():
         raise ValueError(f"the velocity of the strike does not fit {robot.name}")
     rows = None
     if block["follow_through"]["duration_s"] is not None:
         rows, _ = _read_rows(folder / "follow_through.npz", robot)
+        if len(rows.t) == 1 or not np.array_equal(rows.q[0], path.q[-1]):
+            raise ValueError("follow_through.npz does not begin at the end of path.npz")
     rooms = ("joints", "clearance", "center_of_pressure")
     after |= {key: Room(**after[key]) for key in rooms if after.get(key) is not None}
     ends = FollowThrough(**after | {"velocity": velocities[1], "rows": rows})

@@ -38,6 +38,8 @@ from impact_posture.posture.program.constrained_problem import ConstrainedProble
 from impact_posture.posture.search.multistart import PostureSolution, solve
 from impact_posture.robot.support_polygon import polygon_edges
 from impact_posture.system.arrays import Array
+from impact_posture_cli.optimize_summary import _path
+from impact_posture_cli.output import Page
 from tests.support.command import run
 from tests.support.constraints import check_expression
 from tests.support.helpers import rng, robot
@@ -372,6 +374,35 @@ def test_files_mark_the_contact(tmp_path: Path) -> None:
         read_path(tmp_path, block, loaded)
 
 
+# How a strike is damaged: entries of its block, or rows of a file that are left.
+DAMAGED: dict[str, dict[str, object]] = {
+    "text": {"run_up_s": "x"},
+    "no number": {"share": None},
+    "run-up after the contact": {"run_up_s": 99.0},
+    "negative speed": {"speed": -1.0},
+    "other velocity": {"velocity": [0.0] * 14},
+    "one row": {"follow_through": slice(0, 1)},
+    "late begin": {"follow_through": slice(1, None)},
+    "path without contact": {"path": slice(0, -1)},
+}
+
+
+@pytest.mark.parametrize("how", DAMAGED)
+def test_a_damaged_strike_is_refused(how: str, tmp_path: Path) -> None:
+    solution, path = struck("solo8")
+    write_path(tmp_path, solution.problem.robot, path)
+    block = json.loads(json.dumps(path.to_dict()))
+    for key, value in DAMAGED[how].items():
+        if isinstance(value, slice):
+            with np.load(tmp_path / f"{key}.npz") as file:
+                arrays = {name: array[value] if name in "tqva" else array for name, array in file.items()}
+            np.savez(tmp_path / f"{key}.npz", **arrays)
+        else:
+            block["strike"][key] = value
+    with pytest.raises(ValueError, match=r"fit|begin|times"):
+        read_path(tmp_path, block, solution.problem.robot)
+
+
 def test_the_command_prints_the_strike_and_what_bounds_it(tmp_path: Path) -> None:
     robot_file = write(tmp_path, *cart(4.0, 9.0), toml=WALL)
     options = "--normal -1 0 0 --contact-pose position --no-holdable --no-approach --speed 2 --no-codegen --no-report"
@@ -396,6 +427,14 @@ def test_the_command_prints_the_strike_and_what_bounds_it(tmp_path: Path) -> Non
     towards = speed["speed of the contact towards the surface"]
     assert towards[list(track.times).index(strike["contact_s"])] == pytest.approx(strike["speed"]) == towards.max()
     assert speed["largest share of a velocity limit"].max() == pytest.approx(strike["speed"] / 9.0)
+
+
+def test_a_strike_without_any_stop_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    block = json.loads(json.dumps(struck("panda")[1].to_dict()))
+    block["strike"]["follow_through"] |= {"stopped": 0, "longest_s": 0.0, "joints": None, "clearance": None}
+    _path(Page(), block)
+    text = " ".join(capsys.readouterr().out.split())
+    assert "cannot stop after any of 7 considered impacts" in text and "then stops" not in text
 
 
 @pytest.mark.parametrize(
