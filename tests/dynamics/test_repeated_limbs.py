@@ -34,8 +34,6 @@ from tests.support.exported import built
 from tests.support.helpers import assert_close, random_configurations, rng, robot, unit
 from tests.support.tools import need_compiler
 
-OPTIMIZED = True
-
 KINDS = ("revolute", "prismatic", "continuous")
 AXES = ("1 0 0", "0 1 0", "0 0 -1", "0.6 0 0.8")
 COMPUTE: dict[str, Callable[..., np.ndarray]] = {
