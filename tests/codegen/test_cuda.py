@@ -108,7 +108,7 @@ CASES: dict[str, tuple[str, tuple[str, ...], dict[str, Any], Real]] = {
     "energy": ("panda", ("panda_hand_tcp",), {"kind": "energy"}, DOUBLE),
     "coulomb with feet": ("solo8", ("base_link",), {"kind": "coulomb"}, DOUBLE),
     "cone": ("tilthex_arm", ("ee",), {"normal_cone_deg": 20.0}, DOUBLE),
-    "feet, not inlined": ("talos", ("gripper_right_base_link",), {}, DOUBLE),
+    "not inlined": ("talos", ("gripper_right_base_link",), {}, DOUBLE),
 }
 
 
