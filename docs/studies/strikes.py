@@ -6,6 +6,7 @@ are stored in build/strikes.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
@@ -143,9 +144,9 @@ def _row(name: str, runs: list[dict[str, Any]], base: list[float]) -> list[str]:
 
 
 def _notes(runs: list[dict[str, Any]]) -> Iterator[str]:
-    """Yield why runs did not complete, and what the plan of the first run could not reach."""
-    for why in dict.fromkeys(run["why"] for run in runs if run["why"]):
-        yield f"{sum(run['why'] == why for run in runs)} of {len(runs)} runs: {why.rstrip('.')}"
+    """Yield what happened first in runs that did not complete, and what the plan of the first run could not reach."""
+    for (status, first), count in Counter((r["status"], r["why"].split("; ")[0]) for r in runs if r["why"]).items():
+        yield f"{count} of {len(runs)} runs: {status}; {first.rstrip('.')}"
     plan = runs[0]["plan"]
     if plan is not None:
         stop = plan["follow_through"]

@@ -13,6 +13,7 @@ import casadi as ca
 import pytest
 
 from docs.studies import build as building
+from docs.studies import strikes
 from docs.studies.__main__ import main
 from docs.studies.build import build
 from docs.studies.cases import CASES
@@ -229,3 +230,17 @@ def test_the_page_of_the_kernel_has_its_rows(monkeypatch: pytest.MonkeyPatch) ->
     text = "\n".join(lines(Request(only="tilthex", count=1)))
     assert "**tilthex_arm** at `ee`: nq 10, nv 9" in text and "| the same graph, printed by CasADi | – |" in text
     assert re.search(r"^\| floor \|.* 1159 \|", text, re.M)
+
+
+def test_a_strike_beyond_a_bar_is_named_in_its_row() -> None:
+    def row(**changed: float) -> list[str]:
+        contact = {"speed": 0.01, "instant": -0.002, "saturated": 0.0, "ratio": 1.1, "jump": 3.0}
+        runs = [
+            {"status": "completed", "why": "", "plan": None, "contact": part} for part in (contact, contact | changed)
+        ]
+        return strikes._row("strike", runs, [6.0])
+
+    assert row()[-3:] == ["0.50", "2 of 2", "none"] and row()[1] == "+1.0 (+1.0)"
+    for changed in ({"speed": -0.06}, {"instant": 0.011}, {"saturated": 0.001}, {"ratio": 0.84}):
+        assert row(**changed)[-1] == next(iter(changed))
+    assert strikes._row("strike", [{"status": "fell", "contact": None}], [6.0])[-1].endswith("completed")
