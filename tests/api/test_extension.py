@@ -163,7 +163,7 @@ def test_another_controller_lives_through_a_scenario(setback: ModuleType) -> Non
 
 
 def test_the_installed_command_runs_a_registered_controller(setback: ModuleType, tmp_path: Path) -> None:
-    """Each of these gives a one-line error: two faults in the extension package, and a misspelled controller name."""
+    """Two faults in the extension package, and a misspelled controller name, each give a one-line error."""
     needs_mujoco()
     scenario = tmp_path / "aerial.toml"
     scenario.write_text(cut("aerial-vertical", count=1, settle=0.1, dwell=0.2, pause=0.05), encoding="utf-8")

@@ -120,7 +120,7 @@ def test_defaults_agree_with_the_command_line(
 def test_a_stated_speed_friction_or_elasticity_selects_the_objective(
     stated: dict[str, Any], kind: str, tmp_path: Path
 ) -> None:
-    """A stated number counts even if it equals the default: on the command line, in Python, and in a problem file."""
+    """A stated number selects the objective even if it equals the default: in options, in Python, and in a file."""
     prepared = prepare(make_settings({"robot": "ur5", "frame": "tool0", "normal": (0.1, 0.2, 1.0)} | stated))
     theirs, path = prepared.impact, tmp_path / "problem.toml"
     assert ("(auto, because of `" in theirs.choice) == (bool(stated) and "objective" not in stated)

@@ -246,7 +246,7 @@ def test_progress_is_shown_on_a_terminal_only(tmp_path: Path) -> None:
     draw = ("plot", "ur5-tool0", "--figure", "jump")
     for other in ("--quiet", "--json"):
         assert on_terminal(*draw, other, cwd=tmp_path) == ""
-    # Repeat the check with the installed program in a separate process.
+    # The installed program passes the same check in a separate process.
     ours, theirs = os.openpty()
     with subprocess.Popen([COMMAND, *draw], cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=theirs) as process:
         os.close(theirs)

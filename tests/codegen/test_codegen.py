@@ -93,14 +93,15 @@ def built(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 
 
 def test_agrees_with_casadi(built: Built) -> None:
-    # The C code multiplies by reciprocals.  Stiff feet (1/ε of 1e4 robot masses) amplify the rounding difference.
+    # The C code multiplies by reciprocals, so it rounds differently.  Stiff feet (1/ε of 1e4 robot masses) amplify
+    # this difference.
     tolerance = 1e-10 if built.objective.supports else 1e-12
     assert largest_difference(built.library.gradient, built.objective, casadi_reference, 10) <= tolerance
 
 
 def test_agrees_with_pinocchio(built: Built) -> None:
-    # The oracle solves a KKT system for feet with compliance 1e-4/m.  The condition number of this system reduces the
-    # accuracy by at least four digits.
+    # For feet with the compliance 1e-4 divided by the robot mass, the oracle solves a KKT system.  The condition
+    # number of this system costs at least four digits.
     tolerance = 1e-8 if built.objective.supports else 1e-11
     assert largest_difference(built.library.gradient, built.objective, oracle_reference, 10) <= tolerance
 

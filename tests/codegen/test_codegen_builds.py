@@ -182,8 +182,8 @@ def deepest_stack(folder: Path, prefix: str, tool: str, flags: str) -> int:
         size for name, size in sizes.items() if "_lanes" in name and "_block" not in name and "sincos" not in name
     ]
     entries = [size for name, size in sizes.items() if "_block" not in name and "_lanes" not in name]
-    # The deepest call consists of two nested entry functions (or one and the batch function) and one block or sine
-    # function.  Each nested call adds a return address to the stack.
+    # The deepest call has three functions.  An entry function or the batch function calls an entry function, which
+    # calls a block or sine function.  Each call adds a return address to the stack.
     outer = max(sum(sorted(entries)[-2:]), max(entries) + max(lanes, default=0))
     return outer + max(inner) + 4 * 8
 

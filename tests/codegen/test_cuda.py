@@ -128,7 +128,7 @@ def test_equals_the_c_export(case: str, tmp_path: Path) -> None:
     assert ("__noinline__" in (tmp_path / "gpu.cuh").read_text()) == ("not inlined" in case)
     device = bound(on_host(written, objectives), written)
     host = bound(ImpactGradient.load(tmp_path)._library, written)
-    # The rounding differences of feet are larger, because the feet are stiff.
+    # With supports, the rounding differences are larger, because the feet are stiff.
     tolerance = 3e-4 if real is FLOAT else 1e-9 if supports else 1e-12
     for ours, reference in zip(device, host, strict=True):
         for q in sample_postures(robot, 5, 3):

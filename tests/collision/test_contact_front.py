@@ -83,7 +83,7 @@ def test_the_front_of_a_round_or_flat_shape_is_exact(kind: str, direction: tuple
     assert np.dot(front.offset, d) == pytest.approx(front.reach, abs=1e-9)
     assert front.link == "hand"
     local = TURN.T @ (np.array(front.offset) - center)
-    # Along every direction, the point is not farther than the shape, but for the tolerance of a flat front.
+    # In every direction, the shape reaches at least as far as the point, up to the tolerance of a flat front.
     for other in np.random.default_rng(0).normal(size=(50, 3)):
         other /= np.linalg.norm(other)
         assert local @ other <= support(kind, other) + 6e-4
@@ -110,7 +110,7 @@ def test_links_that_cannot_move_relative_to_the_contact_belong_to_its_front(tmp_
     assert front_of(robot, ahead) == ContactFront("palm", pytest.approx((0.25, 0, 0)), pytest.approx(0.25))
     assert front_of(robot, ahead, ("finger_joint",)).reach == pytest.approx(0.45)
     assert front_of(robot, ahead, ("tip_joint",)).reach == pytest.approx(0.25)
-    # A held joint is where the posture has it.
+    # A held joint has the position that the posture states.
     bent = np.array([0.0, np.pi / 2, 0.0])
     both = ("finger_joint", "tip_joint")
     assert front_of(robot, ahead, both).reach == pytest.approx(0.65)
@@ -141,7 +141,7 @@ def test_the_warning_names_the_distance_and_an_option_that_mends_it(tmp_path: Pa
     assert resolved(path, normal=(0, 0, -1), normal_frame="contact", contact_point="front")[1] == pytest.approx(
         offset
     )
-    # Less than the limit is not reported, more is.
+    # A distance below ``BEYOND`` is not reported.  A larger distance is reported.
     assert not resolved(path, normal=n, offset=(0, 0, 0.25 - BEYOND + 1e-4))[0]
     assert resolved(path, normal=n, offset=(0, 0, 0.25 - BEYOND - 1e-4))[0]
     with pytest.raises(ContactError, match="contradicts `offset`"):

@@ -38,7 +38,7 @@ def test_a_link_without_a_shape_behind_the_wall_is_a_warning(folder: Path) -> No
     for line in (BARE, behind):
         assert done.stderr.count(f"warning: {line}") == 1
         assert sum(warning.startswith(line) for warning in result["warnings"]) == 1
-    # Without the surface, nothing is behind it.
+    # Without a surface, no link can be behind the surface, so no warning appears.
     done = run("optimize", "twinboom.urdf", *OPTIMIZE.split(), "--surface", "none", "--force", cwd=folder)
     assert done.returncode == 0 and BARE in done.stderr and behind not in done.stderr
 

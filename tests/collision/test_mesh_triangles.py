@@ -99,7 +99,7 @@ def test_meshes_of_robots(name: str, changed: int, monkeypatch: pytest.MonkeyPat
     ]
     assert len(different) == changed
     for a, b in different:
-        # The corners and their hull are the same, but coal leaves out most of the surface.
+        # Both meshes have the same corners and the same hull, but coal leaves out most of the surface of one mesh.
         assert np.array_equal(mesh_points(a), mesh_points(b))
         assert np.array_equal(np.unique(mesh_triangles(a)), np.arange(len(mesh_points(a))))
         surface = mesh_points(a)[mesh_triangles(a)][:: max(1, a.num_tris // 200)]

@@ -1,4 +1,4 @@
-"""With default gains, the end effector task and `optimize` leave the same degrees of freedom redundant."""
+"""With default gains, the end effector task of the controller leaves the same motions free as `optimize`."""
 
 from __future__ import annotations
 

@@ -97,7 +97,7 @@ def test_commands_in_long_saturation_are_optimal() -> None:
 
 
 def test_the_iterations_of_a_tick_are_bounded_and_suffice() -> None:
-    """Random far states need more iterations than states of a run, but at most half of the limit in the header."""
+    """Random states need more iterations than the states of a run, but at most half of the limit in the header."""
     robot, rng = formulation_of("talos")[0], np.random.default_rng(3)
     c = compiled("talos")
     c.reset(robot.posture(), np.zeros(robot.nv))

@@ -118,7 +118,8 @@ def test_the_reference_moves_as_in_python(
     assert tilt > 0.5 or 0.0515 < most < tilt
     assert path or posture.value < 0.95 * first
     assert np.abs(posture.flow.velocity).max() < 0.02
-    # For talos, the zero moment point reaches two polygon edges at once; Python and C list both in the same order.
+    # For talos, the zero moment point reaches two edges of the polygon at once.  Python and C list these edges in the
+    # same order.
     assert (max(edges) > 1) == (name == "talos")
 
 
@@ -193,7 +194,7 @@ def test_a_stopped_flow_goes_on_from_a_moved_posture_as_in_python() -> None:
             commands = [controller.tick(k * DT, r.posture(), at_rest) for controller in (python, c)]
             np.testing.assert_allclose(commands[1].u, commands[0].u, rtol=0, atol=1e-6)
             if not 200 <= k < 250:
-                # During a fade, the target is its end value in Python and its start value in C.
+                # During a fade, Python returns the end value of the target, and C returns the start value.
                 np.testing.assert_allclose(c.target, posture.target, rtol=0, atol=1e-9)
     np.testing.assert_allclose(firsts[1], firsts[0], rtol=0, atol=1e-9)
 

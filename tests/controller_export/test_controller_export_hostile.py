@@ -95,7 +95,7 @@ def test_a_held_command_is_within_its_limits_and_damps_the_joints() -> None:
         held = controller.tick(0.0, np.full(robot.nq, wrong), v)
         assert held.status is Status.NON_FINITE
         assert np.array_equal(held.u, first.u)
-    # An unmeasurable velocity is ignored, so the controller repeats the last command.
+    # The controller ignores a velocity that no sensor can measure, and repeats the last command.
     for rate in (2e8, -np.inf, np.nan):
         glitch = v.copy()
         glitch[0] = rate

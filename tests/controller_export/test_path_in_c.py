@@ -1,4 +1,4 @@
-"""The references along a path in C are those in Python, and the exported example follows them."""
+"""C and Python compute the same references along a path, and the exported example follows these references."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ def test_invalid_calls_change_nothing() -> None:
     before = np.array(path.block.q)
     path.tick(np.nan, rest, rest, np.inf)
     np.testing.assert_array_equal(np.array(path.block.q), before)
-    # The measured posture of a late contact is not a posture, so the references go on from where they are.
+    # The measured posture of a late contact is invalid, so the references continue from their own posture.
     path.tick(0.5, np.full(9, np.nan), np.full(9, np.nan))
     assert path.block.phase == PathPhase.FOLLOW_THROUGH and np.isfinite(np.array(path.block.q)).all()
 

@@ -161,7 +161,7 @@ def test_the_cost_decides_in_the_free_directions(relaxation: Relaxation) -> None
 
 
 def test_without_levels_or_rows(relaxation: Relaxation) -> None:
-    """The minimizer of z²/2 subject to z ≥ 1 is z = 1 for both possible levels of the bound."""
+    """The bound z ≥ 1 can be on level 0 or on a lower level.  In both cases, the minimizer of z²/2 is z = 1."""
     for level in (0, 1):
         one = np.ones(1)
         tick = RelaxedTick(np.eye(1), 0 * one, np.zeros((0, 1)), one, np.inf * one, np.array([level]), one, one)
@@ -170,7 +170,7 @@ def test_without_levels_or_rows(relaxation: Relaxation) -> None:
 
 
 def test_a_budget_is_kept(relaxation: Relaxation) -> None:
-    """With too few iterations, the result is an error code, and the next tick starts from these active rows."""
+    """With too few iterations, the result is an error code.  The next tick starts from these active rows."""
     tick = ticks_of("talos", "legged")[-1]
     relaxation.forget()
     needed = relaxation.solve(tick).iterations

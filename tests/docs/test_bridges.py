@@ -114,7 +114,7 @@ def test_pink_holds_the_frame(pink_run: PinkRun, name: str) -> None:
     before, after = (frame_placement(model, q, frame) for q in (start, outcome.q))
     turned = np.linalg.norm(pin.log3(before.rotation.T @ after.rotation))
     assert np.abs(after.translation - before.translation).max() <= 1e-9
-    # Linearization within a tick causes a small error.
+    # Each tick linearizes the constraints, which causes a small error.
     assert 0 < outcome.errors.max() <= 1e-5
     if name == TABLE:
         assert turned > 0.5, "the ball tip must turn, because it is redundant"

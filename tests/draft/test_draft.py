@@ -244,7 +244,7 @@ def test_rotors_of_motors_are_no_propellers(tmp_path: Path) -> None:
 
 
 def test_the_example_is_the_same_arm_as_a_urdf_and_as_an_mjcf(tmp_path: Path) -> None:
-    """The MJCF states what the robot.toml adds to the URDF, and no link of the MJCF is fixed to the world."""
+    """The MJCF also contains the data that the robot.toml adds to the URDF, and does not weld the base."""
     pytest.importorskip("mujoco")
     xml, by_hand = (str(QUAD_ARM.parent / path) for path in ("rail_arm_mjcf/rail_arm.xml", "rail_arm/rail_arm.urdf"))
     out, draft = write_draft(xml, LoadOptions(), tmp_path / "rail_arm.toml")

@@ -84,7 +84,7 @@ def compare(model: pin.Model, simulated: InMujoco, q: Vector, generator: np.rand
         assert_close(data.site_xmat[index], placement.rotation, TOLERANCE, f"rotation {site}")
     a = pin.aba(model, model.createData(), q, v, tau)
     assert_close(data.qacc, qacc(layout, q, v, a), TOLERANCE, "acceleration")
-    # The way back.
+    # Convert the posture of MuJoCo back.
     returned = layout.q(layout.qpos(q))
     assert np.abs(pin.difference(model, q, returned)).max() < 1e-12
     assert_close(layout.state(data.qpos, data.qvel)[1], v, 1e-12, "velocity")

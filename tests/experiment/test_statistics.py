@@ -58,7 +58,7 @@ def test_interval_follows_students_t() -> None:
     assert interval.mean - interval.half_width == pytest.approx(low)
     assert interval.mean + interval.half_width == pytest.approx(high)
     assert Interval.of([3.0]) == Interval(3.0, None, 1)
-    # Without sensor noise, runs differ only by rounding.
+    # Runs without sensor noise differ only by rounding, as these three values do.
     same = Interval.of([0.1 + 0.2, 0.3, 0.3])
     assert same.alike and same.shown is None and not interval.alike
     assert statistic(3, [same, same]) == "means of 3 seeds, all alike, because the scenario has no noise"
@@ -246,7 +246,7 @@ def test_the_headline_says_for_whom_the_impact_is_better() -> None:
     )
     assert headline(*compared(share=0.3, base_angular=1.02)).endswith("the impact itself is better")
     assert headline(*compared(impulse=1.1)).endswith("the impact itself is worse")
-    # A change of 30 % within an interval of 57 % is not one, and the text says so.
+    # A change of 30 % with an interval of 57 % is not significant, and the text says so.
     doubtful = compared(base_linear=1.3, noise=0.5)
     assert doubtful[0]["change"]["base_linear"]["half_width"] > 0.06
     assert headline(*doubtful).endswith("the impact itself is no better beyond the intervals")

@@ -1,4 +1,4 @@
-"""Batches of H and the objective: on all cores, by the CUDA kernels as C++, in PyTorch and in JAX."""
+"""Batches of H and of the objective: on all cores, in PyTorch, in JAX, and by CUDA kernels compiled as C++."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.support.tools import need_compiler
 from tests.support.urdfs import joint, link, load
 
 N = np.array([0.0, 0.6, 0.8])
-# A posture of the robot in ``sample`` in whole numbers.
+# A posture of the robot of ``sample``, written with integers.
 WHOLE = [[0] * 6 + [1] + [0] * 2 + [1, 0] + [1, 0] + [0]]
 
 

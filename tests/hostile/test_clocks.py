@@ -32,7 +32,7 @@ COMMANDS = (
 # Seconds of a year, and times of files, s.
 YEAR = 365 * 86_400
 FILES = (0, -YEAR, 2**31 + 1, 2**33, 140 * YEAR)
-# Clocks: the first runs backwards, a second each second.
+# Clocks.  The first clock runs backwards, by one second per second.
 CLOCKS = (
     "@2030-01-01 00:00:00 x-1",
     "@1970-01-02 00:00:00",

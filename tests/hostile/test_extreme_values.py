@@ -1,4 +1,4 @@
-"""Values that once ended in an internal error: one sliding joint, distant origins, dates and few open files."""
+"""Values that once caused internal errors: one sliding joint, distant origins, dates and few open files."""
 
 from __future__ import annotations
 

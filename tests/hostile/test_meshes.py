@@ -109,7 +109,7 @@ def write(path: Path, content: str | bytes) -> Path:
 
 def test_meshes_made_to_break_their_reader(good: dict[str, Path], tmp_path: Path) -> None:
     paths = [write(tmp_path / name, content) for name, content in MESHES.items()]
-    # A good mesh after each bad mesh.
+    # After each bad mesh, a good mesh is read.
     read_meshes([path for bad in paths for path in (bad, write(bad.with_suffix(".good.obj"), OBJ))])
     with judging() as judge:
         for path in paths:

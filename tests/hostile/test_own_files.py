@@ -64,7 +64,7 @@ def test_files_of_users_are_only_replaced_by_force(name: str, result: Path, aren
 
     path.write_text("ten years")
     refused()
-    # After the first command, the program knows its file.
+    # After the first command, the folder has a record of the file.
     for force in (["--force"], []):
         done = strike(arena, *argv, *force)
         assert (done.code, done.complaints) == (0, []), done.err

@@ -46,7 +46,7 @@ def test_files_never_take_the_number_of_a_closed_stream(tmp_path: Path) -> None:
     assert (tmp_path / "file").read_bytes() == b""
 
 
-# Make Python see no folder for temporary files.  This also works for the user root.
+# Python finds no folder for temporary files.  A read-only folder would not have this effect for the user root.
 NO_TEMPORARY_FOLDER = """
 import sys, tempfile
 def refuse():

@@ -50,7 +50,7 @@ def test_a_sole_without_size_bears_no_moment() -> None:
 
 @pytest.mark.parametrize("name", ["solo8", "solo12"])
 def test_an_impact_from_above_presses_all_feet(name: str) -> None:
-    """Every foot impulse points up, but their sum is less than the impact: knees without stiff motors yield."""
+    """Every foot impulse points up.  Their sum is less than the impulse of the impact, because the knees yield."""
     loaded, supports = standing(name)
     q = loaded.posture()
     result = contact_stability(oracle_of(name, (0.0, 0.0, -1.0)), supports, q)
@@ -150,7 +150,7 @@ def test_kept_feet_as_expression_and_in_numbers_agree(name: str, frame: str) -> 
 
 
 def test_kept_feet_change_the_optimum() -> None:
-    """The optimum pulls at the ground only without `keep_contacts`; with it, the given friction suffices."""
+    """Without `keep_contacts`, the optimum pulls at the ground.  With it, the given friction suffices."""
     values = {"robot": "solo12", "frame": "base_link", "normal": (0.0, 0.0, -1.0)}
     free = prepare(make_settings(dict(values)))
     kept = prepare(make_settings({**values, "keep_contacts": True, "friction": 1.0}))

@@ -197,7 +197,7 @@ def test_the_value_is_continuous_at_the_switch_and_has_one_gradient_on_each_side
             there = np.array(pin.integrate(loaded.model, q, sign * step))
             assert coulomb_impact(objective.oracle, there).sticks == (sign < 0)
             assert_close(objective.gradient(there), side, 1e-4, f"side {sign}")
-        # For W = M, the slope of the objective always drops where the contact begins to slip.
+        # For W = M, the slope of the objective always decreases at the posture where the contact begins to slip.
         assert metric == "euclidean" or (sides[1] - sides[0]) @ outward < 0
         exported = np.array(objective.gradient_fun()(q, objective.contact.normal)[1]).ravel()
         assert_close(exported, sides[0], 1e-6, "at the switch the gradient of sticking")

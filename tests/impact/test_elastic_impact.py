@@ -88,7 +88,7 @@ CASES = ("panda", "arm", "mixed arm", "talos", "tilthex_arm", "solo12")
 
 
 class Stepped(NamedTuple):
-    """State of the time stepping at the end of the compression, and the largest values until this time."""
+    """State of the time stepping at the end of the compression, and the largest values before the end."""
 
     duration: float
     x: Vector
@@ -182,7 +182,7 @@ def test_time_stepping_finds_the_same(name: str) -> None:
     assert (response.peak_torque >= np.abs(response.torque) * (1 - 1e-12)).all()
     assert response.peak_jump_norm >= response.jump_norm * (1 - 1e-12)
     assert response.value == pytest.approx((response.jump_norm / speed) ** 2, rel=1e-12)
-    # The supplied energy is the impulse times the approach speed, because free flight would continue at this speed.
+    # The supplied energy is the impulse times the approach speed, because the motion without contact has this speed.
     assert response.impulse * response.speed == pytest.approx(other.energy + other.loss, rel=1e-8)
     assert (other.loss > 0) == (name in ("mixed arm", "talos", "solo12"))
 

@@ -59,7 +59,7 @@ def dense(
     for foot in feet:
         Js = frame_jacobian(loaded.model, q, loaded.frame_id(foot.frame), foot.offset)[: foot.rows]
         inertia += Js.T @ Js / default_compliance(loaded)
-    # The fingers of panda are coupled: ν = C ν, and the follower does not count in the metric.
+    # The fingers of panda are coupled, so ν = C ν.  The metric does not count the follower.
     C, followers = loaded.coupling_matrix, loaded.followers
     weight = np.diag(1.0 - followers) if W is None else W
     A = C @ np.linalg.inv(C.T @ inertia @ C + np.diag(1.0 * followers)) @ C.T @ J.T

@@ -103,7 +103,8 @@ def test_gradients_of_mass_and_jumps_equal_differences(name: str, friction: floa
     assert relative(mass.gradient(q), measured[0]) < 1e-5 and mass.value(q) == value[0]
     expressed, gradient = (np.array(v).ravel() for v in mass.gradient_fun()(q, objective.contact.normal))
     assert relative(expressed, value[:1]) < 1e-9 and relative(gradient, mass.gradient(q)) < 1e-8
-    # The mass of the literature is the inverse of the mobility along the normal; friction never makes it smaller.
+    # In the literature, the effective mass is the inverse of the mobility along the normal.  Friction never reduces
+    # the mass.
     G = objective.oracle.quantities(q).G
     assert value[0] * G == pytest.approx(1) if friction == 0 else value[0] * G > 1
 
@@ -125,7 +126,7 @@ def test_no_posture_exceeds_a_bound_on_the_simulated_force(friction: float) -> N
 
 
 def test_a_bound_that_no_posture_keeps_names_the_least_force(tmp_path: Path) -> None:
-    """Random feasible postures exert no less than the least force in the error, and that force is a valid bound."""
+    """No random feasible posture has less than the least force in the error, and this force is a valid bound."""
     task = {"robot": "tilthex_arm", "normal": (0, 0, 1), "contact_stiffness": 1e5, "approach": True}
     words = "optimize tilthex_arm --normal 0 0 1 --contact-stiffness 1e5 --no-codegen --no-report --max-force"
     done = run(*words.split(), 20, cwd=tmp_path)

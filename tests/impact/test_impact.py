@@ -39,7 +39,8 @@ from tests.support.helpers import (
 KINDS: tuple[ObjectiveKind, ...] = ("impulse", "speed", "sticking", "energy")
 OFFSET = (0.01, -0.02, 0.03)
 VALUE, GRADIENT = 1e-9, 1e-6
-# Best finite-difference step for values accurate to 1e-11 (stiff feet); the derivative's relative error is 1e-9.
+# Best step of finite differences for values with an accuracy of 1e-11 (stiff feet).  The derivative then has a
+# relative error of 1e-9.
 STEP = 2e-4
 
 
@@ -132,7 +133,7 @@ def test_oracle_by_its_definition(name: str) -> None:
         n = np.array(contact.normal)
         if contact.normal_frame == "contact":
             n = frame_placement(model, q, frame).rotation @ n
-        # The fingers of panda are coupled: ν = C ν, and the follower does not count in the metric.
+        # The fingers of panda are coupled, so ν = C ν.  The metric does not count the follower.
         C, followers = loaded.coupling_matrix, np.diag(1.0 * loaded.followers)
         W = M if metric.kind == "kinetic" else np.eye(loaded.nv) - followers
         A = C @ np.linalg.solve(C.T @ held @ C + followers, C.T @ J.T)

@@ -134,7 +134,7 @@ def test_the_oracle_solves_what_it_is_given(
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize(("name", "label"), CASES)
 def test_the_oracles_sticking_impact(name: str, label: str, seed: int | None) -> None:
-    """The errors of S and ∇S are as large as after rounding the matrices, not a squared condition number."""
+    """S and ∇S are as accurate as after a rounding of the matrices: no condition number enters squared."""
     x = bounded(name, label, 1e-4)
     with elsewhere(seed):
         oracle = objective(name, 1e-4).oracle
@@ -274,7 +274,7 @@ def _near(values: Vector, expected: object, tolerance: float, what: str) -> None
 
 
 def test_decimal_elimination_by_its_residual() -> None:
-    """The reference itself is exact: ``K K⁻¹ = 1`` to forty digits at the worst conditioned posture."""
+    """At the posture with the largest condition number, the reference has ``K K⁻¹ = 1`` to forty digits."""
     x = bounded("solo8", "straight", 1e-9)
     residual = x.K @ x.inverse - exact(np.eye(len(x.K)))
     assert abs(residual).max() < Decimal("1e-40")

@@ -244,7 +244,7 @@ def test_skeleton_meets_pinocchio(
     centers = rotors.mean(axis=2) - tilthex.q_initial[:3]
     expected = [r.position for r in tilthex.robot.spec.propulsion.rotors]  # type: ignore[union-attr]
     np.testing.assert_allclose(centers, expected, atol=1e-9)
-    # Both links of the pendulum are drawn, and the second link ends at its center of mass.
+    # Both links of the pendulum are drawn, and the last stick ends at the center of mass of the second link.
     assert len({tuple(p.round(9)) for bone in skeleton(pendulum, pendulum.q_optimal).bones for p in bone}) == 4
 
 

@@ -209,7 +209,7 @@ def test_without_a_path_to_the_optimum_the_answer_is_the_posture_where_the_path_
     assert not path["found"] and posture == path["q"] == reachable["q"] != optimal["q"]
     assert optimal["objective"] == document["solver"]["optima"][0]["objective"] < 0.9 * reachable["objective"]
     assert reachable["objective"] == pytest.approx(path["objective"]) and "attainable_speed" in reachable
-    # The verdict states this first, and its numbers are of the reachable posture.
+    # The verdict begins with this fact, and the numbers of the verdict belong to the reachable posture.
     first = "posture.json is not the optimum but the posture where the path ends: no path to the optimum exists"
     verdict = document["verdict"]
     assert verdict["line"].startswith(f"verdict: {first}") and verdict["conditions"][0]["key"] == "path"
@@ -218,7 +218,7 @@ def test_without_a_path_to_the_optimum_the_answer_is_the_posture_where_the_path_
     assert verdict["after"]["impulse"] != pytest.approx(optimal["jump"]["coulomb"]["normal_impulse"], rel=1e-3)
     share = 1 - reachable["objective"] / document["initial"]["objective"]
     assert f"reduction {100 * share:.1f}% where the path ends; the next lines are about the optimum" in text
-    # The C code, also when it is written again, has the posture of posture.json.
+    # The C code has the posture of posture.json, also if another command writes the code again.
     written = run("codegen", "out", "--out", "again", cwd=tmp_path)
     assert written.returncode == 0, written.stderr
     for source in (tmp_path / "out" / "c", tmp_path / "again"):

@@ -81,7 +81,7 @@ def test_positions_velocities_and_accelerations_agree(
 def test_limits_hold_at_the_rows_and_between_them(
     moments: tuple[Robot, PosturePath, list[tuple[float, Array, Array, Array]]],
 ) -> None:
-    """The oracle is RNEA on the robot's model, with contact forces as sums of friction cone rays."""
+    """The reference is RNEA on the model of the robot, with contact forces as sums of friction cone rays."""
     loaded, path, motion = moments
     model, data = loaded.model, loaded.model.createData()
     base = loaded.first_joint
@@ -133,7 +133,7 @@ def test_limits_hold_for_the_trajectory_as_a_robot_interpolates_it(
         largest = max(largest, float((np.abs(load) / loaded.model.effortLimit).max()))
         assert (np.abs(v(time)) <= 1.01 * loaded.model.velocityLimit).all()
     assert 0.9 < largest <= 1.01
-    # Rows are added at the bends alone.
+    # Additional rows are only at the bends.
     assert len(t) < 2.5 * path.duration / timed_curve.SAMPLE_TIME
 
 

@@ -143,7 +143,7 @@ def test_velocities_that_leave_an_active_bound_are_preferred() -> None:
     solution, path = struck("panda")
     at, worst = path.q[-1], int(np.abs(path.v[-1]).argmax())
     sign, lower, upper = np.sign(path.v[-1][worst]), solution.problem.lower.copy(), solution.problem.upper.copy()
-    # The run-up comes from q − t ν, which this limit forbids.
+    # The run-up begins at q − t ν, and this limit forbids this posture.
     (lower if sign > 0 else upper)[worst] = at[worst]
     blocked = replace(solution.problem, lower=lower, upper=upper)
     velocity = impact_velocity(StrikeSpaces(blocked, at), at, SPEED, 0.05, inside=True)
@@ -173,7 +173,7 @@ def test_links_that_are_slightly_too_near_are_separated() -> None:
     while not near:
         drawn = pin.integrate(problem.robot.model, problem.given, draws.normal(size=problem.robot.nv))
         q = space.projector.project(drawn).q
-        # The clearances are not projected.
+        # Clearances are not projected, so a clearance can have the largest violation.
         worst = max(space.violations(q), key=lambda each: each[1])
         if "surface" in worst[0] and 1e-3 < worst[1] < 5e-3:
             near.append(q)
@@ -214,7 +214,7 @@ def test_a_velocity_limit_bounds_the_speed(tmp_path: Path) -> None:
 
 
 def test_a_motor_that_cannot_move_the_cart_ends_the_path_at_rest(tmp_path: Path) -> None:
-    """At rest the start is the optimum."""
+    """A path at rest ends at the start, because the start is the optimum."""
     path = posture_path(slider(tmp_path, 1e-9, 9.0), strike=2.0)
     assert path.strike is None and len(path.t) == 1
 
@@ -282,7 +282,7 @@ def test_the_stop_after_the_impact_starts_at_the_predicted_velocity(name: str) -
 
 @pytest.mark.parametrize(("effort", "cone"), [(8.0, 0.0), (8.0, 10.0), (5.0, 0.0)])
 def test_a_cart_stops_before_the_end_of_its_slide_or_says_why(tmp_path: Path, effort: float, cone: float) -> None:
-    """The worst impact is 120 % of 1 m/s with restitution 0.5.  The stop needs T = 3/2 v m/F and v T/2."""
+    """The worst impact has 120 % of 1 m/s and restitution 0.5.  Its stop takes T = 3/2 v m/F over v T/2."""
     problem = slider(tmp_path, effort, 9.0, cone).problem
     limits = ActuatorLimits(problem.objective, problem.given, problem.requirements)
     after = follow_through(problem, problem.given, np.array([1.0]), 0.25, limits)

@@ -99,7 +99,7 @@ def test_descents_end_near_optima_on_the_constraints(number: int) -> None:
     assert (ends.x >= problem.lower - 1e-12).all() and (ends.x <= problem.upper + 1e-12).all()
     assert (ends.merit <= manifold.evaluate(before).merit[ends.tag] + 1e-9).all()
     assert np.median(manifold.evaluate(before).merit) - np.median(ends.merit) > 0.5
-    # From most ends, a second descent cannot lower the merit by 1 %, and the best end is certified nearby.
+    # From most ends, a second descent cannot lower the merit by 1 %.  Near the best end is a certified optimum.
     again = descended(manifold, ends.x)
     assert np.mean(ends.merit[again.tag] - again.merit < 0.01) > 0.8
     nlp, best = build_nlp(problem, compile="never"), ends.merit.argmin()
@@ -183,7 +183,8 @@ def test_collisions_and_loads_stay_excluded(robot: str, normal: tuple[float, flo
 
 
 def test_feasible_starts_descend_where_few_random_postures_reach_the_equalities() -> None:
-    # One random posture in a thousand leads to the best of 128 starts (2.904), but four of a hundred feasible starts.
+    # The best objective of 128 starts is 2.904.  One random posture in a thousand leads there, but four of a hundred
+    # feasible starts.
     problem = prepare(
         make_settings({"robot": "solo8", "normal": (0, 0, 1), "collision": True, "holdable": True})
     ).problem

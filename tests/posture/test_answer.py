@@ -102,7 +102,7 @@ def test_code_from_the_cache_is_the_code(
 
     first = texts()
     assert texts() == first and len(count) == 1
-    # Each change of the objective or the options gives the cache entry another key.
+    # If the objective or an option changes, the cache entry has another key.
     other = replace(objective, contact=replace(objective.contact, normal=(0.0, 0.6, 0.8)))
     for changed in ({"objective": other}, {"real": FLOAT}, {"portable": True}):
         assert texts(**changed) != first

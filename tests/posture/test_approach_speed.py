@@ -157,7 +157,7 @@ def test_lifted_rows_agree_with_pinocchio_and_with_differences(name: str) -> Non
 
 @pytest.mark.parametrize(("name", "speed"), [("tiago", 0.8), ("talos", 1.0)])
 def test_an_optimum_that_is_too_slow_moves_to_a_fast_one(name: str, speed: float) -> None:
-    """Both optima certify.  Without the constraint on the speed, the optimum is better but approaches too slowly."""
+    """Both optima are certified.  Without the constraint on the speed, the optimum is better but too slow."""
     wrist = (0.0, 0.0, 0.0)
     free, asked = (prepared(name, speed, approach=approach, offset=wrist) for approach in (False, True))
     attainable = AttainableSpeed(asked.problem.robot, asked.problem.objective, asked.problem.requirements)
@@ -180,7 +180,7 @@ def test_a_speed_beyond_the_joints_is_infeasible_and_named() -> None:
 
 
 def test_a_strike_beyond_the_joints_gets_the_greatest_speed() -> None:
-    """No posture among random ones is faster, and the optimum needs the required speed."""
+    """No random posture is faster, and the constraint on the speed is active at the optimum."""
     posed = prepared("ur5", 20.0, strike=True, contact_pose="aligned")
     solution = solve(posed.problem, starts=2, jobs=1)
     (required,) = (c for c in solution.problem.constraints if isinstance(c, ApproachSpeed))

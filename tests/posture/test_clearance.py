@@ -93,7 +93,7 @@ def test_guess_satisfies_the_rows_where_bodies_are_apart(name: str) -> None:
         rows = ca.Function("rows", [x, lifted.variables], [ca.vertcat(lifted.rows, sides)])
         guess = separator.guess(numeric).values.copy()
         assert len(guess) == separator.count
-        # Without the slack.
+        # Set the slack to zero.
         guess[-1] = 0.0
         value = np.array(rows(chart.to_x(q), guess)).ravel()
         lower, upper = (np.append(np.zeros(EQUATIONS), side) for side in separator.bounds(corners))
@@ -272,7 +272,7 @@ def test_an_obstacle_at_the_contact_is_named() -> None:
     ("pose", "position"), [("full", None), ("full", (3.0, 0.0, 0.0)), ("position", (3.0, 0.0, 0.0))]
 )
 def test_a_turn_that_solves_a_conflict_is_the_hint(pose: str, position: tuple[float, ...] | None) -> None:
-    """Freeing the orientation moves the wrist of z1 out of the floor, but does not help if the target is too far."""
+    """With a free orientation, the wrist of z1 can leave the floor.  A target out of reach remains a conflict."""
     # The floor touches the gripper below the origin of the frame, not at its tip.
     contact = {"robot": "z1", "normal": (0.0, 0.0, 1.0), "offset": (0.0, 0.0, 0.0)}
     settings = contact | {"contact_pose": pose, "target_position": position}
@@ -366,7 +366,7 @@ def test_starts_lie_near_a_posture_that_is_clear() -> None:
 
 @pytest.mark.parametrize("seed", [1, 9, 33])
 def test_the_way_past_a_wall_is_found_from_every_seed(seed: int) -> None:
-    # Only from few random postures does a run reach collision-free postures.
+    # Runs from few of the random postures reach postures without collisions.
     posed = prepare(ProblemSettings(robot="xarm7", normal=(-1, 0, 0))).problem
     assert not find_conflicts(posed, seed).conflicts
 

@@ -42,7 +42,7 @@ PUSHED = {name: {"hold_force": 2.0} for name in ("tilthex_arm", "talos", "panda"
 
 @functools.cache
 def problem(name: str, **more: object) -> ConstrainedProblem:
-    """Return the problem without forces at other objects that a robot may touch, which have separate tests."""
+    """Return the problem without collision constraints, which have separate tests."""
     values = {"robot": name, "normal": (0.3, -0.2, 1.0), "holdable": True, **more}
     return prepare(make_settings(values)).problem
 
@@ -133,7 +133,7 @@ def test_mujoco_stands_still_under_the_torques_and_forces(name: str) -> None:
 
 
 def least_share(posed: ConstrainedProblem, q: Vector) -> float:
-    """Return the same minimum by another program, on friction-pyramid faces and thrusts (N); NaN if unbalanced."""
+    """Return the least share by a program on faces of friction pyramids and thrusts (N); NaN if unbalanced."""
     model, spec = posed.robot.model, posed.robot.spec
     blocks, cones = [], []
     for support in posed.objective.supports:
@@ -221,7 +221,8 @@ def test_reduced_form_has_the_gradient_of_its_largest_row(name: str, seed: int) 
     top = largest(q)
     slope = rng(seed).normal(size=posed.robot.nv)
     ahead, behind = (largest(pin.integrate(posed.robot.model, q, step * slope)) for step in (1e-6, -1e-6))
-    # The largest share has a kink where another actuator becomes the most loaded: the one-sided slopes differ there.
+    # The largest share has a kink where another actuator becomes the most loaded.  The one-sided slopes differ at the
+    # kink.
     sides = [(ahead - top) / 1e-6, (top - behind) / 1e-6]
     above = value == value[0] if value[0] else value > top - 1e-9
     if sides[0] == pytest.approx(sides[1], rel=1e-3, abs=1e-3):

@@ -1,4 +1,4 @@
-"""The optimization against brute force, its certificate against wrong solutions, and its diagnosis."""
+"""The optimization compared with brute force, the certificate of wrong solutions, and the diagnosis of conflicts."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ def test_certificate_refuses_postures_that_are_not_optimal() -> None:
 
 
 def test_certificate_refuses_a_multiplier_of_the_wrong_sign() -> None:
-    """A limit that the objective pulls away from does not make the posture an optimum."""
+    """If the objective decreases away from a limit, the limit cannot make the posture an optimum."""
     problem = problem_of("tilthex_arm")
     scale = problem.objective.value(problem.given)
     line = walk(problem, problem.given, 0.02, 400), walk(problem, problem.given, -0.02, 400)
@@ -183,7 +183,7 @@ def test_infeasible_names_the_conflicting_constraint() -> None:
     with pytest.raises(Infeasible, match="pose of panda_hand_tcp") as caught:
         solve(problem, starts=4, jobs=1)
     assert caught.value.exit_code == 3
-    # The arm reaches 0.855 m from the shoulder, so more than a meter is missing.
+    # The arm reaches 0.855 m from the shoulder, so the target is more than a meter too far.
     assert sum(caught.value.conflicts.values()) > 0.9
 
 

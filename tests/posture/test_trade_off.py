@@ -166,8 +166,8 @@ def test_no_posture_of_a_null_space_of_one_dimension_is_better(case: str) -> Non
     for point in curve.points:
         best = values[away <= point.within].min()
         assert point.objective <= best * (1 + 1e-9)
-        # The curve is not too good either: the walk may overshoot by 0.01 in distance, and its minimum by half of
-        # that.
+        # The objective is also not too low.  The walk may exceed the distance by 0.01, and its minimum by half of
+        # this value.
         assert point.objective >= values[away <= point.within + 0.011].min() - 1e-5 * values.max()
 
 
@@ -178,7 +178,8 @@ def test_no_feasible_neighbor_within_the_distance_is_better() -> None:
     compared = 0
     for point in curve.points[1:-1]:
         for _ in range(12):
-            # Half of the steps point inward, because a random step from the edge of a ball mostly leaves the ball.
+            # Half of the steps point towards the initial posture, because most random steps would exceed the
+            # distance.
             inward = 0.03 * pin.difference(model, point.q, solution.initial)
             step = generator.normal(size=model.nv) * 0.01 + generator.integers(2) * inward
             there = projector.project(pin.integrate(model, point.q, step), tolerance=1e-12)

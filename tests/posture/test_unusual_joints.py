@@ -106,7 +106,7 @@ def test_held_fingers_may_touch(tmp_path: Path, gap: float, noted: bool) -> None
 
 @pytest.mark.parametrize("hold", [(), ("left_joint", "right_joint")])
 def test_pictures_show_no_collision_of_held_fingers(tmp_path: Path, hold: tuple[str, ...]) -> None:
-    """The problem does not check collisions, so the pictures do."""
+    """The problem has no collision constraints, so the figures check for collisions."""
     q = gripper(tmp_path, -0.0004, hold=("left_joint", "right_joint")).given
     unchecked = prepared(tmp_path / "written.urdf", hold=hold, collision=False)
     assert drawn_collisions(unchecked, q) == ([] if hold else [("left", "right")],)

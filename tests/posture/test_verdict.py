@@ -300,7 +300,7 @@ def test_the_command_prints_the_verdict_first(tmp_path: Path) -> None:
         ("impulse", {"friction": 0.0}, "coulomb"),
         ("impulse", {"normal_cone": 5.0}, "sticking"),
         ("impulse", {"normal_cone": 5.0, "friction": 0.0}, None),
-        # The verdict does not blame an objective that minimizes the compared jump.
+        # If the objective minimizes the compared jump, the verdict does not advise another objective.
         ("speed", {"friction": 0.0}, None),
         ("sticking", {"friction": 5.0}, None),
         ("sticking", {"friction": 0.0}, "coulomb"),
@@ -311,7 +311,7 @@ def test_another_objective_is_advised_only_if_it_minimizes_the_jump(
 ) -> None:
     prepared = prepare(make_settings({"robot": "panda", **NORMAL, "objective": kind, **more}))
     evaluation = prepared.impact.evaluate()
-    # For the given posture itself, the verdict is not an improvement.
+    # If both postures are the same, the verdict states no improvement.
     told = verdict(prepared.impact, evaluation, evaluation)
     assert told.outcome == "no better"
     advised = [line for line in told.advice if "minimizes this whole jump" in line]

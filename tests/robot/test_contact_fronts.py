@@ -1,4 +1,4 @@
-"""The default contact frames of the catalogue touch where their tools end, or a warning says how far they do not."""
+"""The default contact points of the catalogue are at the ends of the tools, or a warning states the distance."""
 
 from __future__ import annotations
 

@@ -195,7 +195,8 @@ def test_limits_of_a_follower_bound_its_leader(tmp_path: Path) -> None:
     loaded, bounds = limits('lower="-1" upper="2"')
     assert bounds == pytest.approx([-0.95, -1, 0.55, 2])
     assert loaded.velocity_limits == pytest.approx([2.5, 5])
-    # A range that leaves the leader none is not used. Equal limits hold a joint, so they do not bound the leader.
+    # A range of the follower that leaves no range for the leader is ignored.  Equal limits hold the follower, so they
+    # do not bound the leader.
     loaded, bounds = limits('lower="6" upper="7"')
     assert bounds == pytest.approx([-2.5, -4.9, 2.5, 5.1])
     assert [line for line in loaded.warnings if "[6, 7] of 'b' contradict" in line]

@@ -33,7 +33,8 @@ def test_robust_against_nominal(
     name: str, settle: float, changes: dict[str, Any], nominal: Band, reduction: Band, lowered: Band
 ) -> None:
     metrics, before = [], []
-    # After the time `settle`, q and H of the robust controller equal the values after 6 s within 8 %.
+    # With the time `settle` before the impact, the motion q and H of the robust controller are within 8 % of the
+    # values for 6 s.
     for controller, seconds in (("nominal", 0.5), ("robust", settle)):
         factory = controller_factory(shortened(name, settle=seconds, **changes))
         record = driven(factory, controller)

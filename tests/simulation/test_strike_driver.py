@@ -31,7 +31,7 @@ pytest.importorskip("toppra", reason="toppra is not installed (the extra 'path')
 
 @cache
 def factory_of(nearer: float = 0.0, count: int = 1) -> ControllerFactory:
-    """Return a factory of an arm and a table, which is nearer than planned by this distance, m."""
+    """Return a factory of an arm and a table.  The table is nearer than planned by the distance ``nearer``, m."""
     scenario = shortened("panda-tap", count=count, settle=0.8, pause=0.3 * (count > 1)).scenario
     surfaces = tuple(replace(s, gap=s.gap - nearer) for s in scenario.surfaces)
     factory = controller_factory(set_up(replace(scenario, surfaces=surfaces)))

@@ -129,7 +129,7 @@ def test_an_arm_on_a_fixed_base_meets_a_table(folder: Path, which: str, controll
 
 @pytest.mark.parametrize(("pose", "size"), [("position", 3), ("aligned", 5)])
 def test_the_end_effector_task_can_leave_the_spin_or_orientation_free(folder: Path, pose: str, size: int) -> None:
-    """All controllers use this end effector task, and the offline optimum leaves the same motion free."""
+    """All controllers use this end effector task, and the motion to the offline optimum turns the free axes."""
     text = HIT.format(robot="panda", frame=known_robot("panda").spec.contact.frame, more="")
     path = folder / f"{pose}.toml"
     path.write_text(text.replace("kp = 100", f'pose = "{pose}"\nkp = 100'), encoding="utf-8")

@@ -31,7 +31,7 @@ ROWS, CONTACT = 28, 8
 
 
 def rows_of(group: Group, generator: np.random.Generator) -> dict[str, Vector]:
-    """Simulate a hit of the model ``reflected``; each torque sensor shows the impulse on its rotor in two rows."""
+    """Simulate a hit of the model ``reflected``.  Each torque sensor shows the impulse on its rotor."""
     q0, v0 = (np.array(values[group.posture]) + 1e-3 * generator.normal(size=7) for values in (POSTURES, RATES))
     t = PERIOD * np.arange(ROWS)[:, None]
     acceleration = np.array([2.0, 1.0, 1.5, 4.0, -2.0, 1.0, 3.0])
@@ -56,7 +56,7 @@ def integral(values: Vector) -> Vector:
 
 
 def own_jump(arm: Arm, box: int, q: Vector) -> Vector:
-    """Return the plastic jump per approach speed, by an own formula with Pinocchio and without this program."""
+    """Return the plastic jump per approach speed, computed with Pinocchio alone."""
     model = pin.buildModelFromUrdf(str(URDF))
     link = model.inertias[7]
     mass = link.mass + arm.mass

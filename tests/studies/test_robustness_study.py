@@ -274,7 +274,7 @@ def test_correlations_and_splits_by_hand() -> None:
     # differ in one record, and so do the signs of jump and H.
     for metric in ("q_total_impact", "peak_jump"):
         assert statistics.agreement(records, ["robust"], "H", metric) == (3, 4)
-    # S correlates perfectly with the jump of `robust`.
+    # In these records, S correlates perfectly with the jump of `robust`.
     alone = [replace(r, documents={"robust": r.documents["robust"]}) for r in records]
     assert statistics.ranks_of_jumps(alone, ("H", "V", "S")) == pytest.approx(
         {"n": 4, "H": 0.2, "V": math.nan, "S": 1.0}, nan_ok=True

@@ -108,7 +108,7 @@ def test_a_standing_box_slides() -> None:
 
 
 def test_a_box_hit_from_below_leaves_the_ground() -> None:
-    """The ground carries the weight until the surface does."""
+    """The surface lifts the box as soon as its force exceeds the weight."""
     result = hit_box(np.zeros(3), 0.5, gravity=9.81, feet=True, normal=np.array(DOWN), speed=0.05)
     assert result.force == pytest.approx(MASS * 9.81 + 0.05 * np.sqrt(STIFF * MASS), rel=5e-3)
     assert result.up == pytest.approx(0.05, rel=1e-6)

@@ -93,7 +93,7 @@ class ExactImpact:
 
     @cached_property
     def inverse(self) -> Exact:
-        """Inverse ``K⁻¹``; its first nv rows and columns are ``M̃⁻¹``."""
+        """Inverse of the system matrix ``K``; the first nv rows and columns are ``M̃⁻¹``."""
         return solve(self.K, exact(np.eye(len(self.K))))
 
     @property

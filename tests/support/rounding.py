@@ -2,7 +2,8 @@
 
 OpenBLAS has a kernel for each family of processors, and each kernel rounds differently.  Each result is the exact
 solution for a matrix that differs in the last digits.  Therefore, random changes in the last digits of a matrix
-before its factorization represent all kernels.  A test that passes only by luck fails after such a change.
+before its factorization represent all kernels.  A test that depends on the rounding of this processor fails after
+such a change.
 """
 
 from __future__ import annotations

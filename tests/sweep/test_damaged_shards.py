@@ -146,7 +146,7 @@ def test_every_damage_is_noticed(solved: tuple[Sweep, str, Path], tmp_path: Path
         atlas = Atlas(tmp_path / "out", sweep, key)
         with atlas.opened():
             assert len(atlas.waiting()[1]) == len(damaged) and sorted(atlas.damaged) == damaged
-        # To continue the sweep takes longer, and is the same for all kinds of damage.
+        # Continuing the sweep takes long, and does not depend on the kind of damage.
         if k % 10 == 0 or hostile_full:
             again = run_sweep(sweep, tmp_path / "out")
             assert again.damaged == tuple(damaged) and again.shards == len(damaged)

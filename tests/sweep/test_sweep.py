@@ -62,7 +62,7 @@ starts = 4
 x = { from = 0, to = 0.04, count = 3 }
 z = [0, 2]
 """
-# For the same pose, the optima of panda differ by a factor of four in the objective.
+# At each pose, panda has optima whose objectives differ by a factor of four.
 SWITCHING = """
 shard = {shard}
 [problem]
@@ -351,7 +351,7 @@ def test_a_folder_of_another_sweep_is_refused(aerial: Path, tmp_path: Path, monk
 
 
 def test_speeds_with_the_same_problem_have_the_same_result(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The better optimum is at the last point; along y, only points of the first speed are adjacent to it."""
+    """The better optimum is at the last point.  Along y, only points with the first speed are adjacent."""
     values = {(0, 0): 9.0, (0, 1): 9.0, (1, 0): 9.0, (1, 1): 1.0}
     template = SimpleNamespace(problem=object())
     solver: Any = SimpleNamespace(

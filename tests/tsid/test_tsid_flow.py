@@ -336,7 +336,7 @@ def test_it_moves_for_its_duration_after_each_start() -> None:
     flow = flow_of(r, arm_well(), duration=0.5)
     flow.on, moved = True, list[float]()
     for late in (0, UPDATE_TICKS):
-        # The second time, the flow rests until the next update of the gradient.
+        # After the second call of `brace`, the flow rests until the next update of the gradient.
         for _ in range(round(0.5 / DT) + late):
             flow.advance(DT, flow.q)
         assert not np.abs(flow.velocity).max() > 1e-4

@@ -92,7 +92,7 @@ def test_hard_states_are_answered(name: str, kind: str) -> None:
 
 @pytest.mark.parametrize(("name", "kind"), [("tilthex_arm", "strict"), ("kinova", "arm"), ("talos", "legged")])
 def test_broken_measurements_hold_the_command_and_are_forgotten(name: str, kind: str) -> None:
-    """A valid measurement follows each invalid one, and the last command is the same as without invalid ones."""
+    """Invalid measurements between valid ones do not change the last command."""
     controller, posture = bracing(name, kind)
     r = controller.robot
     q, v, force = r.posture(), 0.01 * rng(name).normal(size=r.nv), np.zeros(6)

@@ -300,13 +300,13 @@ def wrist() -> tuple[Robot, TaskFormulation]:
 
 
 def flying() -> tuple[Robot, TaskFormulation]:
-    """The second hinge rolls the tip; if the first link is vertical, the hinge yaws the tip, as the base does."""
+    """The second hinge rolls the tip.  If the first link is vertical, this hinge and the base yaw the tip."""
     r = arm([Y, Z, Y], [0.3, 0.4, -0.2], floating=True)
     return r, aerial_formulation(r, JointPosture(r), law=None)
 
 
 def two_levels() -> tuple[Robot, TaskFormulation]:
-    """Both levels are singular at the same posture; the lower level needs the direction that the upper one frees."""
+    """Both levels are singular at one posture.  There, the upper level frees a direction for the lower level."""
     r = arm([Z, Y, Y, X, Y, X], [0.3, 0.4, 0.8, 0.2, 0.5, 0.1], floating=False, effort=0.0)
     tip, elbow = FramePosition(Point(TIP), kp=60.0), FramePosition(Point("link_2", (0, 0, -0.3)), kp=60.0)
     return r, TaskFormulation(((tip,), (elbow,)), (), JointPosture(r), law=None)
