@@ -26,7 +26,7 @@ def build(name: str) -> Any:
 
 
 class CommandGroup(TyperGroup):
-    """Group of subcommands.  It builds only the parser of the called subcommand, so that ``--help`` stays fast."""
+    """Group of subcommands that builds only the parser of the called subcommand, so that ``--help`` stays fast."""
 
     def __init__(self, **attributes: Any) -> None:
         super().__init__(**attributes)

@@ -8,7 +8,7 @@ from itertools import zip_longest
 
 # Options whose value may be omitted.  The next argument is the value if it matches the pattern.
 _OPTIONAL = {
-    # The pattern allows fractions, because the option itself reports them as an error.
+    # The pattern permits fractions, because the option itself reports a fraction as an error.
     "--tradeoff": re.compile(r"[+-]?[0-9.]+$"),
     "--write-robot-toml": re.compile(r".*\.toml$"),
 }

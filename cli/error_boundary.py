@@ -58,7 +58,7 @@ def run(command: Any, arguments: Sequence[str]) -> int:
         return error.code if isinstance(error.code, int) else 1
     except Exception as error:
         if isinstance(error, BrokenPipeError) or getattr(error, "errno", None) == errno.EPIPE:
-            # The reader has closed the pipe, for example ``| head``: end without an error message.
+            # End without an error message, because the reader has closed the pipe (for example ``| head``).
             _discard_output()
             return 1
         if os.environ.get(DEBUG_VARIABLE):

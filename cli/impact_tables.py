@@ -92,6 +92,6 @@ def _impulses(frames: Sequence[str], worst: Mapping[str, Any]) -> str:
 
 
 def alone_line(page: Page, frames: Sequence[str], what: str) -> None:
-    """If there are several contacts, print which contact the shown numbers belong to."""
+    """If there are several contacts, print the contact to which the shown numbers belong."""
     if len(frames) > 1:
         page.line(f"  ({what}: of an impact at {frames[0]} alone)", style="dim")

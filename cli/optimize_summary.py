@@ -89,7 +89,7 @@ def summarize(page: Page, prepared: Prepared, solution: PostureSolution, documen
         bare = len(document["collision"]["links_without_shapes"])
         among = f" among the links that have shapes ({bare} ha{'ve' if bare > 1 else 's'} none)" if bare else ""
         page.line(f"no collision{among}; closest: {at['closest']}, {1e3 * at['distance']:.3g} mm")
-    # Count optima by their printed value.  The values of mirrored postures differ only by rounding errors.
+    # Count optima by their printed values, because the values of mirrored postures differ only by rounding errors.
     hits = Counter[str]()
     for optimum in solution.optima:
         hits[number(optimum.objective)] += optimum.hits
@@ -107,7 +107,7 @@ def summarize(page: Page, prepared: Prepared, solution: PostureSolution, documen
         _tradeoff(page, document, [n for n in document["notes"] if n.startswith("trade-off:")])
     if "path" in document:
         _path(page, document["path"])
-    # The first warnings were printed before the solver started.
+    # Leave out the first warnings, which were printed before the solver started.
     page.warnings(document["warnings"][len(prepared.warnings) :])
 
 
@@ -187,7 +187,7 @@ def _path(page: Page, path: dict[str, Any]) -> None:
                 page.line(f"  the least distance {what} is {number(room['distance'])} {unit}: {where}")
         if after["hindrance"]:
             page.line(f"  {after['hindrance']}")
-    # The verdict states why a path does not reach the optimum.
+    # If the path does not reach the optimum, the verdict states the reason.
     if path["found"] and path["reason"]:
         page.line(f"  {path['reason']}")
 

@@ -21,13 +21,13 @@ _LEAST_MEMORY = 1 << 30
 def prepare() -> None:
     """Set up streams, environment and signals.  Only the entry point calls this, because it changes the process."""
     _open_streams()
-    # With an umask such as 777, the program could neither read nor remove its own files.
+    # Let the program read and remove its own files.  A umask such as 777 would prevent this.
     os.umask(os.umask(0o077) & 0o077)
     # Always use the file backend, because a notebook backend or a missing backend in the environment would fail.
     os.environ["MPLBACKEND"] = "agg"
     # NumPy and Matplotlib fail if the date of a reproducible build is not a number.  No output contains a date.
     os.environ.pop("SOURCE_DATE_EPOCH", None)
-    # Rich makes lines of this width, which fill the memory if it is huge, and are empty if it is zero.
+    # Rich makes lines of this width.  A huge width fills the memory, and lines of width zero are empty.
     if not re.fullmatch(r"[1-9]\d{0,3}", os.environ.get("COLUMNS", "80")):
         del os.environ["COLUMNS"]
     # Threads of the linear algebra do not help with small matrices, but they use memory and can fail to start.
@@ -68,7 +68,7 @@ def _open_streams() -> None:
         try:
             os.fstat(number)
         except OSError:
-            # The system assigns the lowest free number, which is this number.
+            # The system assigns the lowest free descriptor, which is the descriptor of the closed stream.
             os.open(os.devnull, os.O_RDWR)
     sys.stdout = sys.stdout or open(1, "w", closefd=False)
     sys.stderr = sys.stderr or open(2, "w", closefd=False)

@@ -10,7 +10,7 @@ from datetime import timedelta
 
 # Minimum time between two updates with the same text, s.
 _REFRESH = 0.1
-# The remaining time is estimated only after this time, s.
+# The line shows no estimate of the remaining time before this time, s.
 _PACE = 2.0
 
 
@@ -21,7 +21,7 @@ def progress(
     """Show a progress line while the block runs.
 
     The line shows the messages of the library (:func:`impact_posture.system.progress.tell`) and the progress that the
-    block reports.  For these reports, the block receives a function with the arguments ``(done, all)``.  If no line
+    block reports.  The block reports by a function with the arguments ``(done, all)``, which it receives.  If no line
     is shown, the block receives ``None``.  If ``unit`` is empty, the line shows a bar but no numbers.  Before the
     first report, the line shows ``first`` instead of ``doing``.
     """
@@ -37,8 +37,8 @@ def progress(
     from impact_posture.system.processes import undone
     from impact_posture.system.progress import listening
 
-    # Do not update the line in a thread: worker processes are forked during the block, and long calls of C code block
-    # all Python threads.
+    # Do not update the line in a thread, because worker processes are forked during the block.  Also, long calls of C
+    # code block all Python threads.
     words = TextColumn("{task.description}", markup=False)
     columns = (words, BarColumn(), TextColumn("{task.fields[count]}"), TimeElapsedColumn())
     line = Progress(*columns, console=console, transient=True, auto_refresh=False)
@@ -64,7 +64,7 @@ def progress(
             line.update(task, count=f"{done}/{total} {unit}{left}")
         show(doing, done / total)
 
-    # The line hides the cursor.  If a signal ends the process, line.stop shows the cursor again.
+    # The progress line hides the cursor.  If a signal ends the process, ``line.stop`` shows the cursor again.
     with undone(line.stop), listening(show), line:
         line.refresh()
         yield advance

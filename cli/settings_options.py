@@ -30,7 +30,7 @@ class TypedSettings:
 
     Attributes:
         context: Typer context of the command.
-        values: Name of a setting → its value.
+        values: Name of a setting → value.
     """
 
     context: typer.Context

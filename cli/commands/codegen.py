@@ -109,8 +109,8 @@ def codegen(
 def _check_problem(typed: TypedSettings, robot: str) -> None:
     """Check that a contact is given.
 
-    If no contact is given and ``robot`` is a folder, the user probably means a result folder.  Then the error states
-    why this folder is not a result.
+    If no contact is given and ``robot`` is a folder, the user probably means a result folder.  The error then states
+    why the folder is not a result.
     """
     if not {"contact", "normal"} & typed.values.keys() and (os.path.isdir(robot) or robot.endswith(os.sep)):
         from impact_posture.output.result_reader import load_view
@@ -145,7 +145,7 @@ def _result_parts(
 ) -> tuple[Robot, TaskFormulation, WorstCaseObjective, PosturePath | None]:
     """Return the robot of a result, its task formulation, its objective, and the path that its controller follows.
 
-    With a reference flow, or if the robot stays at its start, there is no path to follow.
+    The path is ``None`` with a reference flow, or if the robot stays at its start.
     """
     from impact_posture.controller_export.default_formulation import default_formulation
     from impact_posture.output.result_reader import load_view
@@ -160,7 +160,7 @@ def _result_parts(
 def _controller_parts(
     typed: TypedSettings, robot: str, kind: ControllerKind, flow: bool, scenario: str | None
 ) -> tuple[Robot, TaskFormulation, WorstCaseObjective | None]:
-    """Return the robot, its task formulation, and the objective that the posture task minimizes, if any."""
+    """Return the robot, its task formulation, and the objective of the posture task; ``None`` for no objective."""
     if scenario is not None:
         from impact_posture.simulation.controllers.controller_factory import ControllerFactory
         from impact_posture.simulation.scenario_file import read_scenario

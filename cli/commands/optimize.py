@@ -18,7 +18,7 @@ from impact_posture_cli.settings_options import TypedSettings, with_settings
 if TYPE_CHECKING:
     from impact_posture.output.result_folder import Written
 
-# High thresholds, with which the garbage collector rarely runs.
+# Thresholds of the garbage collector.  They are high, so that the garbage collector rarely runs.
 _RARELY = 200_000, 50, 100
 
 RobotOrProblem = Annotated[
@@ -45,7 +45,7 @@ def optimize(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    # Garbage collection would only take time, because most objects are in use until the result is printed.
+    # Garbage collection would take time without freeing memory, because most objects are used until the end.
     gc.set_threshold(*_RARELY)
     settings = _settings(robot, typed)
     _refuse_idle(typed, settings)
@@ -70,7 +70,7 @@ def optimize(
         check_strike(prepared.problem, prepared.impact.speed)
     folder = Path(out) if out else default_out(prepared)
     check_output(folder, force=force, kind="result")
-    # A name that TOML forbids is an error before the search, not after it.
+    # Raise the error for a name that TOML forbids now, before the search.
     dump_settings(resolved_settings(prepared))
     announce(page, prepared)
     with page.progress("solving", "starts", first="building the expressions") as advance:
@@ -82,7 +82,7 @@ def optimize(
             compile=compile,
             search=settings.search,
             progress=advance,
-            # If no path reaches the best optimum, the next best optimum is used.  So the search needs all optima.
+            # If no path reaches the best optimum, the next best optimum is used.  Therefore, search all optima.
             finish_all=settings.finish_all or settings.path,
         )
     if settings.tradeoff:

@@ -106,7 +106,7 @@ def simulate(
     if json:
         print_json(document)
     else:
-        # The first warnings are about the scenario, and were written before the run.
+        # Leave out the first warnings.  They are about the scenario, and were written before the run.
         _show(page, document, job.label, folder, document["warnings"][len(factory.setup.warnings) :])
     if document["status"] != "completed":
         sys.stdout.flush()

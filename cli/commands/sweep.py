@@ -126,7 +126,7 @@ def _executor(
 
 
 def _show(page: Page, folder: Path, axes: str | None, out: str | None, format: list[Any] | None, force: bool) -> None:
-    """Draw the maps of a sweep folder; print its best points and how often neighbors have different optima."""
+    """Draw the maps of a sweep folder; print the best points, and how often neighbors have different optima."""
     from impact_posture.sweep.maps import draw_maps
 
     wanted = tuple(name.strip() for name in axes.split(",")) if axes else None

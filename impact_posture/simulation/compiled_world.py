@@ -39,7 +39,7 @@ class Ticks(NamedTuple):
     Attributes:
         trace: True states after the ticks.
         rotor_speed: Rotor commands, shape (n, rotors).
-        level: Activation levels of the controller's preparation for an impact, 0 to 1, shape (n,).
+        level: Activation levels with which the controller prepares for an impact, 0 to 1, shape (n,).
         status: Status numbers of the controller, shape (n,).
     """
 
@@ -109,9 +109,8 @@ class CompiledWorld:
 def compiled_world(world: World, tick: CompiledTick | None, count: int) -> CompiledWorld | None:
     """Return the C loop for a world after its reset, or ``None`` if Python must run the ticks.
 
-    Python runs the ticks without a C controller, or if the loop cannot be compiled, for example because the
-    MuJoCo headers are missing.  Python also runs worlds with more than 64 rotors and worlds that :meth:`World.in_c`
-    excludes.
+    Python runs the ticks if there is no C controller, or if the loop cannot be compiled (for example, without MuJoCo
+    headers).  Python also runs worlds with more than 64 rotors and worlds that :meth:`World.in_c` excludes.
     """
     contents = None if tick is None else world.in_c(count)
     if tick is None or contents is None or contents["rotors"] > _ROTORS:

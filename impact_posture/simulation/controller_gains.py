@@ -53,8 +53,8 @@ class RobustTerm(StrictTable):
     Attributes:
         gain: K of the term, 1/s².  The curvature of the objective scales the term, so K is a stiffness like ``kp``.
         ramp: Time in which the term is switched on gradually, s.
-        fade: Two distances from a position limit, rad (m).  The term is full at the larger distance, and falls to
-            zero at the smaller distance.
+        fade: Two distances from a position limit, rad (m).  Beyond the larger distance, the term has its full size.
+            Towards the smaller distance, the term falls to zero.
     """
 
     gain: Positive
@@ -69,7 +69,7 @@ class StanceGains(StrictTable):
 
     Attributes:
         friction: Coulomb coefficient that the controller assumes.
-        least: Minimum normal force of a contact point, or of a whole sole, N.
+        least: Minimum normal force of each contact point or sole, N.
         force_weight: Weight of contact forces in the cost, 1/N².
         lifted: Frames of supports that are in the air, for example the foot that hits the ground.
     """
@@ -91,8 +91,8 @@ class Control(StrictTable):
         period: Duration of a tick, s, at most an hour.
         tilt: Gains of the task that keeps the base level (first priority).
         end_effector: Gains of the end effector task (second priority); the rows of the position come first.
-        apparent_mass: Mass M_d, kg.  A measured force F̂ adds ``F̂/M_d`` to the acceleration of the end effector task;
-            with ``None``, the task ignores the force.
+        apparent_mass: Mass M_d, kg.  A measured force F̂ adds ``F̂/M_d`` to the acceleration of the end effector
+            task; with ``None``, the task ignores the force.
         center_of_mass: Gains of the center of mass task.
         base: Gains of the base orientation task.
         footing: Contact constraints of a standing robot; ``None`` for a robot that does not stand.

@@ -46,13 +46,13 @@ class Metrics:
         contacts: Number of contacts (or pushes) that happened.
         contacts_asked: Number of contacts (or pushes) that the scenario requests.
         rested: Whether the robot was at rest before the push or throw; true for contacts.
-        base_linear: Largest change of the linear velocity of a floating base, in the time of ``peak_jump``, averaged
-            over the contacts, m/s.  ``None`` for a fixed base, or without contact.
+        base_linear: Largest change of the linear velocity of a floating base in the time interval of ``peak_jump``,
+            averaged over the contacts, m/s.  ``None`` for a fixed base, or without contact.
         base_angular: Like ``base_linear``, but of the angular velocity, rad/s.
-        joint: Joint whose largest change of velocity, in the time of ``peak_jump``, is the largest share of its
-            velocity limit in any contact.  ``None`` without contact.
-        impulse: Impulse of the contact along the normal, in the time of ``peak_jump``, averaged over the contacts,
-            N·s.  For pushes, the impulse of the push.
+        joint: Joint with the largest change of velocity relative to its velocity limit, in the time interval of
+            ``peak_jump`` of any contact.  ``None`` without contact.
+        impulse: Impulse of the contact along the normal in the time interval of ``peak_jump``, averaged over the
+            contacts, N·s.  For pushes, the impulse of the push.
     """
 
     q_total_impact: float
@@ -164,8 +164,9 @@ def before(series: Series, window: Window) -> int:
 def impact_load(setup: Setup, series: Series, window: Window) -> ImpactLoad:
     """Return the effects on base, joints and contact within :data:`JUMP` after the start of an impact window.
 
-    The jump is the largest ``‖ν(t) − ν⁻‖``.  For pushes, it is the largest ``‖ν‖`` in the window.  The changes of
-    base and joints are also the largest within this time.  The peak force is the largest in the window.
+    The jump is the largest ``‖ν(t) − ν⁻‖`` in this time.  For pushes, it is the largest ``‖ν‖`` in the window.  The
+    changes of base and joints are the largest changes in the same time.  The peak force is the largest force in the
+    window.
     """
     end, inside = window.end if setup.scenario.push else window.begin + JUMP, series.slice(window.begin, window.end)
     ticks, k = series.slice(window.begin, end), before(series, window)

@@ -22,7 +22,7 @@ from impact_posture.system.arrays import Array
 from impact_posture.system.progress import tell
 from impact_posture.tsid.flow.flow_direction import FlowOptions
 
-# Holding the posture may need at most this share of the limits of motors and rotors.
+# To hold the posture, motors and rotors may need at most this share of their limits.
 SHARE = 0.8
 # Default number of starts.
 OFFLINE_STARTS = 8
@@ -30,9 +30,9 @@ OFFLINE_STARTS = 8
 # moves half as far, and its objective is 1 % larger.  The humanoid thus avoids postures in which its controller loads
 # the legs unevenly.
 _NEARNESS = 0.005
-# Margins, the largest first, because large margins are not feasible from every start.  The first number is the
-# distance from the joint stops, rad (m), so that no joint rests on its stop.  The second number is the distance of
-# the center of mass from the edges of the support polygon, m, so that an impact does not tip the robot.
+# Margins, tried in this order, because large margins are not feasible from every start.  The first number of a pair
+# is the distance from the joint stops, rad (m), so that no joint rests on a stop.  The second number is the distance
+# of the center of mass from the edges of the support polygon, m, so that an impact does not tip the robot.
 _MARGINS = ((0.1, 0.05), (0.0, 0.05), (0.0, 0.025), (0.0, 0.0))
 
 
@@ -45,7 +45,7 @@ class OfflinePosture:
         objective: Objective at the optimal posture.
         initial: Objective at the start posture after its projection onto the constraints.
         distance: Distance of the optimal posture from the projected start posture, rad (m).
-        note: Requirement that the posture does not satisfy, and the reason; empty if all are satisfied.
+        note: Requirement that the posture does not satisfy, and the reason; empty if it satisfies all requirements.
     """
 
     solution: PostureSolution
@@ -79,7 +79,7 @@ def offline_posture(
 
     - The robot does not collide with itself, the surface or the ground.
     - Motors and rotors need at most :data:`SHARE` of their limits to hold the posture.
-    - The end effector is at the surface, in the directions that its task controls.  If ``at_contact`` is false, the
+    - The end effector touches the surface, with the pose that its task controls.  If ``at_contact`` is false, the
       end effector stays at its start.
     - The base of a flying robot stays level.
     - The feet of a standing robot stay in place.  The center of mass is above the feet, and the base tilts at most as
@@ -87,11 +87,11 @@ def offline_posture(
 
     - With ``keep_feet``, no foot of a standing robot lifts or slides during the impact.
 
-    If no posture satisfies the last requirement, or if every posture that the search reaches collides, the result is
-    the best posture without this requirement, with a ``note``.
+    If the search does not reach a posture with all constraints, it drops ``keep_feet``, and then also the constraints
+    on collisions.  The ``note`` of the result states the last dropped constraint.
 
     Raises:
-        Infeasible, SolverFailed: As in :func:`impact_posture.posture.search.multistart.solve`.
+        Infeasible, SolverFailed: The same errors as in :func:`impact_posture.posture.search.multistart.solve`.
     """
     tell("looking for the offline posture")
     wanted, note = scenario_requirements(setup, objective, at_contact=at_contact), ""

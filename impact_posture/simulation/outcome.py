@@ -24,13 +24,14 @@ from impact_posture.system.optional_package import import_mujoco
 # The outcomes are listed from the best to the worst.
 Outcome = Literal["completed", "lost contact", "control lost", "fell"]
 OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)
-# Only every 25th tick is checked for links behind a surface.
+# Links behind a surface are searched only in every 25th tick.
 _EVERY = 25
 # Largest number of pairs of touching links that a warning lists.
 _MOST = 4
-# A joint origin that is deeper behind a surface, m, has moved through it.  Compression of a contact is less deep.
+# A link has moved through a surface if its joint origin is deeper than this behind the surface, m.  The compression
+# of a contact is smaller.
 _DEEP = 0.02
-# The prediction fits if the measured jump divided by the predicted jump is in this range.
+# The prediction fits if the measured velocity jump divided by the predicted velocity jump is in this range.
 _FITS = (0.67, 1.5)
 
 
@@ -170,7 +171,7 @@ def _falls(setup: Setup, series: Series) -> list[Event]:
     }
     for name, n in built.normals.items():
         if (setup.q[:3] - built.points[name]) @ n < bounds.clearance:
-            # Ignore surfaces that the base is behind at the start, because real surfaces do not extend that far.
+            # Ignore a surface if the base is behind it at the start, because real surfaces do not extend that far.
             continue
         words = f"the base came closer than {bounds.clearance:g} m to" if bounds.clearance else "the base went into"
         broken[f"{words} the surface '{name}'"] = (places - built.points[name]) @ n < bounds.clearance

@@ -16,7 +16,7 @@ from impact_posture.tsid.controller import Command
 
 # The metric is evaluated only at every tenth tick, because only figures need it.
 _EVERY = 10
-# After this number of ticks, the true states are read from the world, so that its log of contacts stays short.
+# Number of ticks after which the true states are read from the world, so that the log of contacts stays short.
 _BLOCK = 1000
 _NUMBERS = {status: k for k, status in enumerate(STATUSES)}
 

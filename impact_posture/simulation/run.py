@@ -23,11 +23,13 @@ from impact_posture.system.arrays import Array
 from impact_posture.system.processes import fork_call
 from impact_posture.system.progress import tell
 
-# Controllers start to prepare for the impact at this time, s.  Transients of sensors and motors are over by then.
+# Controllers start to prepare for the impact at this time, s.  At this time, transients of sensors and motors are
+# over.
 BRACE = 0.1
-# Number of ticks between two progress messages of loops in Python and in C.
+# Number of ticks between two progress messages: ``_TELL`` for the loop in Python, ``_TELL_IN_C`` for the loop in C.
 _TELL, _TELL_IN_C = 100, 1000
-# Maximum number of ticks in a run, nearly three hours at 1 kHz.  A tick of an arm needs about a kilobyte of memory.
+# Maximum number of ticks in a run, nearly three hours at 1 kHz.  The record of a tick of an arm takes about a
+# kilobyte.
 _MOST = 10**7
 # Maximum number of physics steps in a tick.  A tick must be short, because a signal cannot interrupt it.
 _MOST_STEPS = 10**5
@@ -43,7 +45,7 @@ class Run:
         sign: Sign of the push or throw; 1 for contacts.
         waited: Start of the impact window of the push or throw, s; NaN for contacts.
         rested: Whether the robot was at rest before the push.  If the robot does not come to rest, the push starts
-            after the time ``patience`` of the scenario, and the metrics contain the motion before the push.
+            after the time ``patience`` of the scenario.  The metrics then contain the motion before the push.
         away: Time at which the state diverged and the run ended, s; ``None`` if the state did not diverge.
     """
 
@@ -104,7 +106,7 @@ class _Loop:
             raise InputError(what, where=setup.scenario.source, hint="change control.period or physics.timestep")
         command = driver.reset(setup.q)
         self.world.reset(setup.q, seed=seed, rotor_speed=command.rotor_speed)
-        # The loop in C knows its targets before the first tick, and no references of the posture task.
+        # The loop in C needs all targets before the first tick, and does not support references of the posture task.
         in_c = None if driver.leads_posture else driver.compiled
         self.compiled = compiled_world(self.world, in_c, self.count)
         self.recorder = Recorder(setup, factory.metric)

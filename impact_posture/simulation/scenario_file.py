@@ -107,7 +107,7 @@ class Bounds(StrictTable):
 @checked
 @dataclass(frozen=True)
 class Spread(StrictTable):
-    """Largest random changes of the scenario by a seed (:mod:`impact_posture.simulation.seed_variation`).
+    """Largest random changes that a seed makes in the scenario (:mod:`impact_posture.simulation.seed_variation`).
 
     Attributes:
         joints: Change of each joint at the start, rad or m.
@@ -141,7 +141,7 @@ class ScenarioTable(Scene, RobotSettings):
         throw: Throw of a ball at the robot, or ``None``.
         control: Gains of the controllers.
         bounds: Bounds that a run must not violate.
-        spread: Random changes of the scenario by a seed.
+        spread: Largest random changes that a seed makes in the scenario.
     """
 
     schema: Literal["impact-posture/scenario/1"] = "impact-posture/scenario/1"
@@ -162,7 +162,7 @@ class ScenarioTable(Scene, RobotSettings):
         return super().laws if self.throw is None else (*super().laws, ("throw", self.throw.solref))
 
     def faced(self, shape: Shape) -> Surface | None:
-        """Return the surface that the point ``offset`` of a shape faces: for contacts, the surface that is hit."""
+        """Return the surface that the point ``offset`` of a shape faces; for contacts, the surface that is hit."""
         hit = self.contacts.surface if self.contacts is not None and self.contacts.frame == shape.frame else ""
         return next((s for s in self.surfaces if s.name == hit), super().faced(shape))
 
@@ -194,7 +194,7 @@ class ScenarioTable(Scene, RobotSettings):
 @checked
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Scenario(ScenarioTable):
-    """Experiment as described in the file ``source``, before the robot is loaded."""
+    """Experiment that the file ``source`` describes, before the robot is loaded."""
 
     source: str = ""
 

@@ -1,6 +1,6 @@
-"""Changes of a scenario by its seed: start posture, speed or force of the impact, friction, place of the surface.
+"""Changes that a seed makes in a scenario: start posture, speed or force of the impact, friction, and surface.
 
-Seed 0 is the scenario as its file states it.  Every controller gets the same changes for the same seed.
+Seed 0 changes nothing.  For the same seed, every controller gets the same changes.
 """
 
 from __future__ import annotations
@@ -26,9 +26,10 @@ from impact_posture.system.arrays import Array
 
 # Least distance of the center of mass of a standing robot from the edges of the support polygon, m.
 _COM_MARGIN = 0.02
-# Random changes of a standing base, divided by the changes of the joints.
+# Ratio of the random changes of a standing base to the random changes of the joints.
 _BASE = 0.2
-# Number of draws of a start whose feet can keep their places, and largest error of the feet, m.
+# ``_DRAWS`` is the number of attempts to draw a start whose feet keep their places.  ``_FEET`` is the largest error
+# of the feet, m.
 _DRAWS, _FEET = 20, 1e-8
 
 
@@ -36,7 +37,7 @@ def set_up_with(scenario: Scenario, seed: int) -> Setup:
     """Set up a scenario with the changes of a seed (``[spread]`` in the scenario file).
 
     Raises:
-        ImpactPostureError: As :func:`~impact_posture.simulation.setup.set_up`.
+        ImpactPostureError: The same errors as in :func:`~impact_posture.simulation.setup.set_up`.
         Infeasible: The feet of a standing robot cannot keep their places at any drawn start.
     """
     spread = scenario.spread
@@ -52,7 +53,7 @@ def set_up_with(scenario: Scenario, seed: int) -> Setup:
 
 
 def _displaced(setup: Setup, generator: np.random.Generator) -> Setup:
-    """Return the scenario in a world whose surface is not quite where the controllers expect it."""
+    """Return the scenario with a surface that is shifted and tilted from the place that the controllers expect."""
     scenario, robot, n, spread = setup.scenario, setup.robot, setup.scenario.normal, setup.scenario.spread
     angle, heading, shift = generator.uniform(-1, 1, 3) * [np.deg2rad(spread.normal), np.pi, spread.gap]
     across = cone_axes(n)[:, 1:] @ [np.cos(heading), np.sin(heading)]
@@ -66,7 +67,7 @@ def _displaced(setup: Setup, generator: np.random.Generator) -> Setup:
 
 
 def _scaled(scenario: Scenario, speed: float, friction: float) -> Scenario:
-    """Return the scenario with its speed or force, and its friction, multiplied by a factor."""
+    """Return the scenario with its speed or force multiplied by ``speed``, and its friction by ``friction``."""
     surfaces = tuple(replace(s, friction=friction * s.friction) for s in scenario.surfaces)
     scenario, task = replace(scenario, surfaces=surfaces), scenario.task
     if isinstance(task, RepeatedContacts):
@@ -94,7 +95,7 @@ def _start(setup: Setup, size: float, generator: np.random.Generator) -> Array:
 
 
 def stand(setup: Setup, q: Array) -> Array | None:
-    """Return the posture nearest to ``q`` whose feet are at their places; ``None`` if none is reached.
+    """Return the posture nearest to ``q`` whose feet are at their places; ``None`` if the search fails.
 
     The center of mass stays above the support polygon.
     """

@@ -35,7 +35,8 @@ class Window:
         contact: Number of the contact or push, starting at 0.
         begin: Start of the window, s.
         end: End of the window, s.
-        touched: Whether the impact happened.  If it did not, the window begins at the expected time of the impact.
+        touched: Whether the impact happened.  Without an impact, the window begins at the expected time of the
+            impact.
     """
 
     kind: str
@@ -58,12 +59,12 @@ class Series:
         rotor_speed: True rotor speeds, shape (n, rotors).
         force: Force on the shape of the task, or force of the push, world, N, shape (n, 3).
         peak: Largest normal force on the shape of the task within the tick, N, shape (n,).
-        impulse: Impulse of this force since the start, world, N·s, shape (n, 3); NaN in files of older versions.
+        impulse: Impulse of ``force`` since the start, world, N·s, shape (n, 3); NaN in files of older versions.
         slip: Sliding speed of the shape of the task, or of the fastest foot for pushes, m/s, shape (n,).
         touching: Number of shapes in contact, shape (n,).
         feet: Whether each supporting foot is in contact, shape (n, feet).
         objective: H of the impact, shape (n,); NaN in ticks in which H was not evaluated.
-        level: Activation level of the controller's preparation for an impact, 0 to 1, shape (n,).
+        level: Activation level with which the controller prepares for an impact, 0 to 1, shape (n,).
         status: Status of the controller as an index into :data:`STATUSES`, shape (n,).
         at_stop: Whether each joint is at a position limit, shape (n, nv).
         reference: Distance of the reference along its approach, m, shape (n,); zero for pushes.

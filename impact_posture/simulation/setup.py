@@ -86,8 +86,8 @@ def naming_keys(scenario: Scenario) -> Iterator[None]:
         if {where.partition(" ")[0], where.rpartition(" ")[2]} & _KEYS and scenario.source:
             where = f"{scenario.source}, {where}"
         elif where in ("", "problem") or (isinstance(error, NameNotFound) and "." not in where):
-            # The scenario names a frame or joint that the robot does not have.  Keep a ``where`` with a dot, because
-            # it is a key of robot.toml.
+            # The scenario names a frame or joint that the robot does not have.  Do not change a ``where`` with a dot,
+            # because this ``where`` is a key of robot.toml.
             where = scenario.source
         what, hint = (
             text.replace("`contact_pose`", "control.end_effector.pose").replace("`", "")

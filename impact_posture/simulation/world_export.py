@@ -40,7 +40,7 @@ def export_world(setup: Setup, out: Path, *, force: bool = False) -> None:
     lines = [" ".join([key, *map(repr, map(float, values))]) for key, values in _parameters(setup, model)]
     with whole_folder(out, force=force, kind="world") as folder:
         (folder / "world.xml").write_text(mjcf.spec.to_xml(), encoding="utf-8")
-        # MuJoCo itself cannot open a file if the path is not UTF-8.
+        # Python writes the file, because MuJoCo cannot open a file whose path is not UTF-8.
         content = np.empty(mujoco.mj_sizeModel(model), np.uint8)
         mujoco.mj_saveModel(model, None, content)
         (folder / MODEL).write_bytes(content.tobytes())

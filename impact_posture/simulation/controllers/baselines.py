@@ -77,7 +77,7 @@ class FlowPosture(ImpactRobustPosture):
         self._flow = np.zeros(state.nv)
 
     def contact(self) -> None:
-        """Fade the flow out.  :class:`WalkerDriver` then moves the reference back to the robot's posture."""
+        """Fade the flow out.  :class:`WalkerDriver` then moves the posture reference to the present posture."""
         self.activation.enter(Phase.CONTACT)
 
     def advance(self, state: State, dt: float) -> None:
@@ -115,7 +115,8 @@ class WalkerDriver(RobustDriver):
     def hold(self) -> None:
         """Stop the flow and hold the present posture, center of mass and base orientation."""
         super().hold()
-        # Other tasks can slow the robot, so that the reference is ahead.  Move it to the posture of the robot.
+        # Other tasks can slow the robot.  The reference is then ahead of the robot, so move it to the present
+        # posture.
         self.posture.move_to(self.controller.state.q, self.posture.activation.ramp)
 
 
@@ -123,10 +124,10 @@ class ReleaseDriver(RobustDriver):
     """Apply the impact-robust term without the nominal stiffness ``K_p`` until ``H`` no longer decreases.
 
     Without ``K_p``, the robot reaches the optimum; with ``K_p``, it would come to rest before the optimum.  The scale
-    ``λ`` of the term is the larger of the curvatures at the start and at the offline optimum, so that the stiffness
-    of the term hardly exceeds ``K`` between these postures.  If ``H`` decreases by less than the share :attr:`LEAST`
-    within :attr:`PATIENCE` (s), the controller holds the reached posture.  The term must have ``spring="release"``
-    and an activation that is not live.
+    ``λ`` of the term is the larger of the curvatures at the start and at the offline optimum.  Therefore, the
+    stiffness of the term hardly exceeds ``K`` between these postures.  If ``H`` decreases by less than the share
+    :attr:`LEAST` within :attr:`PATIENCE` (s), the controller holds the reached posture.  The term must have
+    ``spring="release"`` and an activation that is not live.
     """
 
     PATIENCE, LEAST = 0.5, 0.01

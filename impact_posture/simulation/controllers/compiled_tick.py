@@ -26,8 +26,8 @@ from impact_posture.tsid.controller import Command, Controller
 from impact_posture.tsid.tasks.task import TargetTask
 
 _PREFIX = "controller"
-# Compiler options for the generated code.  For a humanoid, -O1 needs 2 s and makes ticks 10 % faster.  Higher levels
-# of optimization need much more time.
+# Compiler options for the generated code.  For a humanoid, compiling with -O1 takes 2 s and makes ticks 10 % faster.
+# Higher levels of optimization take much more time.
 _QUICK = ("-O1",)
 
 
@@ -83,8 +83,8 @@ class CompiledTick:
         """Send the changed targets to C.  Return the names of their tasks."""
         moved = []
         for task in self._tasks:
-            # Python assigns a new object to change a target, so a different object means a change.  Targets that only
-            # C changes are the same objects.
+            # Python assigns a new object to change a target, so a different object means a change.  If C changes a
+            # target, the object stays the same.
             rates = task.target_velocity, task.target_acceleration
             now = (task.target, rates[0].tobytes(), rates[1].tobytes())
             sent = self._sent.get(task.name)
@@ -114,7 +114,7 @@ def compiled_tick(controller: Controller, structure: Structure, objective: Worst
                 raise CompilerError(
                     "the compiler wrote no library", where=str(folder), hint="set CC to another compiler"
                 )
-    # Do not use names of the manifest: another robot with the same code may have written it.
+    # Do not use names of the manifest, because another robot with the same code may have written the manifest.
     return CompiledTick(controller, structure, CompiledController.load(folder))
 
 

@@ -42,7 +42,7 @@ class Reference:
 
     def __init__(self, task: RepeatedContacts, gap: float) -> None:
         v, a = task.speed, task.acceleration
-        # Use ``v * v``: if it overflows, the result is infinite, but ``v**2`` raises OverflowError.
+        # Use ``v * v``, because an overflow gives infinity.  ``v**2`` would raise an OverflowError.
         run_up = v * v / (2 * a)
         if not run_up <= gap:
             what = f"{v:g} m/s at {a:g} m/s² requires {run_up:.3g} m, but the gap is {gap:.3g} m"

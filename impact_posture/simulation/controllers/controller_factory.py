@@ -66,8 +66,7 @@ MEANING: dict[str, str] = {
     "walker": "the posture target follows the negative gradient of H",
 }
 CONTROLLERS = tuple(MEANING)
-# A controller with this suffix has an additional stiffness: the stiffness of the impact-robust term at the posture in
-# which the controller rests.
+# This suffix adds the stiffness that the impact-robust term has at the posture in which the controller rests.
 _STIFF = "-stiff"
 _PLAIN = {
     "nominal": Driver,
@@ -149,19 +148,19 @@ class ControllerFactory:
 
     @cached_property
     def metric(self) -> Callable[[Array], float]:
-        """Function ``q → H``, evaluated by the CasADi interpreter because this needs no compilation."""
+        """Function ``q → H``, evaluated by the CasADi interpreter, which does not compile the function."""
         tell("building the expressions")
         function, normal = self.objective().value_fun(), np.array(self.objective().contact.normal, dtype=float)
         return lambda q: float(function(q, normal))
 
     def offline(self, name: str = "posture") -> OfflinePosture | None:
-        """Return the offline posture of a controller, or ``None`` for a controller without one."""
+        """Return the offline posture of a controller; ``None`` if the controller uses no offline posture."""
         name = name.removesuffix(_STIFF)
         return self._optimum(name) if name in _OFFLINE else None
 
     def _optimum(self, name: str) -> OfflinePosture:
-        # With the controller ``path``, the end effector must stay at its start, so its optimum differs from the
-        # optimum of ``posture``.  The plan of a strike assumes that the feet stay.
+        # With the controller ``path``, the end effector must stay at its start, so the optimal posture differs from
+        # the optimal posture of ``posture``.  The plan of a strike assumes that the feet stay in place.
         kind, strikes = _KINDS.get(name, "impulse"), name == "strike" and self.setup.scenario.contacts is not None
         key = kind, name != "path", strikes
         if key not in self._offline:
@@ -195,7 +194,7 @@ class ControllerFactory:
         return path
 
     def path_of(self, name: str) -> PosturePath | None:
-        """Return the path that a controller follows; ``None`` if it follows none."""
+        """Return the path that a controller follows; ``None`` for a controller without a path."""
         name = name.removesuffix(_STIFF)
         if name == "strike" and self.setup.scenario.contacts is not None:
             return self.strike
@@ -312,7 +311,7 @@ class ControllerFactory:
         """Convert exceptions into errors that name controller ``name``, if it belongs to another package.
 
         Raises:
-            InputError: The code of the other package raised an exception, or returned what cannot be used.
+            InputError: The code of the other package raised an exception, or returned an object of the wrong type.
         """
         try:
             yield

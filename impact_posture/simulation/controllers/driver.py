@@ -143,13 +143,13 @@ class FlowDriver(Driver):
 
 
 class PostureDriver(Driver):
-    """Nominal controller that moves to an offline posture, ``target`` of shape (nq,), after :meth:`brace`."""
+    """Nominal controller that moves to the offline posture ``target``, shape (nq,), after :meth:`brace`."""
 
     def __init__(self, setup: Setup, posture: JointPosture, target: Array) -> None:
         super().__init__(setup, posture)
         self._goal = target
         self._since: float | None = None
-        # Tuples (task, target at the start of the motion, target at the end of the motion).
+        # Each tuple contains a task, its target at the start of the motion, and its target at the end of the motion.
         self._moves: list[tuple[CenterOfMass | BaseOrientation, Any, Any]] = []
 
     def reset(self, q: Array) -> Command:

@@ -25,8 +25,8 @@ class StrikeDriver(Driver):
     switch to the stop after the impact.  When the end effector has to return, the robot moves back to the beginning
     of the run-up.
 
-    The thrust of rotors lags behind its command, so the accelerations of a robot with rotors are ahead of the other
-    references by the mean time constant of the rotors.
+    The thrust of rotors lags behind the command.  For a robot with rotors, the acceleration references are therefore
+    ahead of the other references by the mean time constant of the rotors.
 
     Attributes:
         path: Path with a strike.

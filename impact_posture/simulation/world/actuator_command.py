@@ -17,7 +17,7 @@ from impact_posture.system.arrays import Array
 from impact_posture.system.optional_package import import_mujoco
 from impact_posture.tsid.controller import Command
 
-# A larger position (m), speed (m/s, rad/s) or torque (N·m) means that the state has diverged.
+# The state has diverged if a position (m), speed (m/s, rad/s) or torque (N·m) is larger than this.
 RUNAWAY = 1e6
 
 

@@ -8,7 +8,8 @@ import numpy as np
 
 from impact_posture.system.arrays import Array
 
-# A contact with friction has three constraint rows.  A contact without friction has only the first row.
+# ``_ROWS`` are the three constraint rows of a contact with friction.  ``_FIRST`` selects the first row, the only row
+# of a contact without friction.
 _ROWS, _FIRST = np.arange(3), np.arange(3) == 0
 # Indices with which a cross product is computed: (a × b)ᵢ = a[_NEXT[i]] b[_LAST[i]] − a[_LAST[i]] b[_NEXT[i]].
 _NEXT, _LAST = [1, 2, 0], [2, 0, 1]
@@ -25,7 +26,7 @@ class ShapeTruth(NamedTuple):
         force: Force on the shape in the last step, world, N, shape (3,).
         impulse: Impulse on the shape since the reset, world, N·s, shape (3,).
         peak: Largest sum of the normal forces since the last evaluation, N.
-        began: Time of the first push by a surface since the last evaluation, s; ``None`` if no surface pushed.
+        began: Time at which a surface first pushed since the last evaluation, s; ``None`` if no surface pushed.
         slip: Largest tangential speed of the contact points, m/s; 0 without contact.
     """
 
@@ -95,7 +96,7 @@ class ContactLog:
         self._steps.append(_Step(number, data.time, *(part.copy() for part in parts)))
 
     def fold(self, number: int) -> None:
-        """Evaluate the recorded steps if there are at least :data:`_MOST` steps and no mark."""
+        """Evaluate the recorded steps if there are at least :data:`_MOST` recorded steps and no mark."""
         if len(self._steps) >= _MOST and not self._marks:
             self._marks.append((number, None))
             *_, peak, began, _ = self.look()

@@ -58,7 +58,7 @@ def add_link_geoms(mjcf: Mjcf, robot: Robot) -> dict[str, LinkGeom]:
                 mjcf.spec.add_mesh(name=names[g], uservert=points.ravel(), inertia=convex)
                 law["meshname"] = names[g]
             body.add_geom(name=names[g], type=source.geom_type[g], size=source.geom_size[g], mass=0.0, **law, **at)
-    # Locked joints merge bodies, so the bodies that are next to each other in the file are excluded one by one.
+    # Locked joints merge bodies.  Therefore, exclude each pair of bodies that are next to each other in the file.
     mjcf.spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_FILTERPARENT
     parents_touch = source.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT
     # Bodies that are fixed to the world collide with the bodies next to them.

@@ -17,10 +17,11 @@ from impact_posture.system.arrays import Array
 class Rotors:
     """Speeds ω of the propellers, in the unit of ``speed_max``.
 
-    Each speed follows its command ω*, clipped to ``[speed_min, speed_max]``, with ``ω̇ = (ω* − ω)/τ``.  τ is
-    ``time_constant_up`` if ω* > ω and ``time_constant_down`` otherwise.  Each step uses the exact solution.  The
-    thrust is ``c_f ω²`` along the direction of the rotor, and the drag moment is ``κ`` times the thrust, against the
-    spin.  Gyroscopic moments are not simulated, because the robot model has no inertias of propellers.
+    Each command ω* is clipped to ``[speed_min, speed_max]``.  The speed follows the command with
+    ``ω̇ = (ω* − ω)/τ``.  τ is ``time_constant_up`` if ω* > ω and ``time_constant_down`` otherwise.  Each step uses
+    the exact solution.  The thrust is ``c_f ω²`` along the direction of the rotor.  The drag moment is ``κ`` times
+    the thrust, against the spin.  Gyroscopic moments are not simulated, because the robot model has no inertias of
+    propellers.
 
     Raises:
         SpecError: ``speed_min`` is not below ``speed_max``.
@@ -76,7 +77,7 @@ class Rotors:
 class Vibration:
     """Vibration of unbalanced propellers in the measured twist of the base.  The body itself does not vibrate.
 
-    Propeller i at ``p_i`` with unbalance U (kg·m) turns with the speed ω_i about ``d_i``.  Its centrifugal force is
+    Propeller i at ``p_i`` with unbalance U (kg·m) turns with the speed ω_i about ``d_i``.  The centrifugal force is
     ``U(2πω_i)² e_i``.  The unit vector ``e_i = cos φ_i x_i + s_i sin φ_i y_i`` turns in the plane of the propeller,
     with the spin ``s_i`` and ``φ̇_i = 2πω_i``.  The time integral of the force is the momentum
     ``f_i = 2πω_i U (sin φ_i x_i − s_i cos φ_i y_i)``.  With fixed joints, the resulting twist is

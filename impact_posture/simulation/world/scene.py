@@ -30,7 +30,7 @@ class Surface(ContactLaw):
     Attributes:
         name: Name of the surface.
         normal: Direction out of the surface towards the robot, in world axes, of any length.
-        point: Point on the surface, world, m.  If ``None``, ``gap`` determines where the surface is.
+        point: Point on the surface, world, m.  With ``None``, ``gap`` determines the position of the surface.
         gap: Distance of the surface from the nearest shape of the robot in the start posture, m.
     """
 
@@ -50,9 +50,9 @@ class Shape(StrictTable):
         size: Radius of a sphere, or three half extents of a box, m.
         kind: ``sphere``, or ``box`` with its edges along the axes of the frame.
         offset: Contact point in the coordinates of the frame, m.
-        center: Center of the shape in the coordinates of the frame, m.  By default, ``offset`` is the
-            point of the sphere, or the middle of the face of the box, that is nearest to :meth:`Scene.faced` in the
-            start posture.
+        center: Center of the shape in the coordinates of the frame, m.  By default, the center follows from
+            ``offset``.  ``offset`` is then the point of the sphere, or the middle of the face of the box, that is
+            nearest to the surface :meth:`Scene.faced` in the start posture.
     """
 
     frame: str
@@ -77,8 +77,8 @@ class Physics(StrictTable):
     Attributes:
         timestep: Time step of the physics, s, at least a picosecond.
         gravity: Gravity, world, m/s²; ``None`` for the gravity of the robot model.
-        stop_solref: ``solref`` of the joint stops, as in :class:`ContactLaw`.
-        stop_solimp: ``solimp`` of the joint stops, as in :class:`ContactLaw`.
+        stop_solref: ``solref`` of the joint stops, with the meaning in :class:`ContactLaw`.
+        stop_solimp: ``solimp`` of the joint stops, with the meaning in :class:`ContactLaw`.
     """
 
     timestep: Annotated[float, between(1e-12, 1e100, "s")] = 2.5e-4
@@ -133,8 +133,8 @@ class Sensors(StrictTable):
 class Scene(StrictTable):
     """Surroundings of a robot.
 
-    Every shape can touch every surface.  A thrown ball, the link with the rotors, and the links of an MJCF have
-    further contacts.
+    Every shape can touch every surface.  A thrown ball, the link with the rotors, and the links of an MJCF can also
+    have contacts.
     """
 
     surfaces: tuple[Surface, ...] = ()
@@ -148,7 +148,7 @@ class Scene(StrictTable):
         return (("stops", self.physics.stop_solref), *((s.name, s.solref) for s in self.surfaces))
 
     def faced(self, shape: Shape) -> Surface | None:
-        """Return the surface that the point ``offset`` of a shape faces: the first surface."""
+        """Return the surface that the point ``offset`` of a shape faces, which is the first surface."""
         return next(iter(self.surfaces), None)
 
     def __post_init__(self) -> None:

@@ -40,7 +40,7 @@ NO_FORCE = [0.0, 0.0, 0.0]
 
 
 class ForceFilter:
-    """First-order low-pass filter of a force.  ``turns`` is the cutoff frequency multiplied by the time step.
+    """First-order low-pass filter of a force.  ``turns`` is the product of cutoff frequency and time step.
 
     ``force`` is the filtered force, N, three numbers.
     """

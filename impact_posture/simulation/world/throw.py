@@ -24,7 +24,7 @@ FLIGHT = 0.01
 BALL = xml_name("thrown ball")
 # Position of the ball before the throw, m.  The ball falls freely from there, far away from the robot.
 _AWAY = (0.0, 0.0, -1e3)
-# Tangential mobility at the surface of a solid sphere, multiplied by its mass: 1 + mr²/I with I = ⅖ mr².
+# Tangential mobility at the surface of a solid sphere times the mass of the sphere: 1 + mr²/I with I = ⅖ mr².
 _SPIN = 3.5
 
 
@@ -55,8 +55,8 @@ class Settling(StrictTable):
 class Throw(ContactLaw, Settling):
     """Throw of a solid ball at a shape of a robot at rest.
 
-    The ball starts :data:`FLIGHT` before it touches the shape.  It flies straight towards the center of the shape,
-    which must be a sphere.  The frictionless impulse then passes through the center for any orientation of the shape.
+    The ball starts :data:`FLIGHT` before it touches the shape.  The shape must be a sphere, and the ball flies
+    straight towards the center of this sphere.  The frictionless impulse then passes through the center of the shape.
 
     Attributes:
         frame: Frame of the shape at which the ball is thrown.
@@ -76,7 +76,7 @@ class Throw(ContactLaw, Settling):
 
 
 def thrown_impulses(oracle: ImpactOracle, q: Array, throw: Throw, speed: float) -> tuple[Array, Array, Array]:
-    """Return the impulses of the ball without friction, for a sticking ball, and with its friction, shapes (3,).
+    """Return three impulses of the ball, shape (3,) each: without friction, if the ball sticks, with its friction.
 
     The mobility at the contact is ``B + D``.  ``B = J M⁻¹Jᵀ`` is the mobility of the robot.  The mobility ``D`` of
     the ball is ``1/m`` along the normal and ``3.5/m`` in the tangent plane.  Without rebound, the impulse is

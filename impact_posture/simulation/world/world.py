@@ -162,8 +162,8 @@ class World:
         with unwarned():
             self._advance(speed, count)
         state = self._data.qpos, self._data.qvel
-        # If the sum of squares is below ``RUNAWAY²``, every number is below ``RUNAWAY``.  Otherwise, check each
-        # number.
+        # If the sum of squares is below ``RUNAWAY²``, every number is below ``RUNAWAY``.  Only a larger sum requires
+        # a check of each number.
         usual = state[0].dot(state[0]) + state[1].dot(state[1]) < RUNAWAY**2
         if not usual and not all(np.abs(part).max() < RUNAWAY for part in state):
             raise SimulationDiverged(self.time, where=self.robot.name)
@@ -248,8 +248,8 @@ class World:
     def in_c(self, count: int) -> dict[str, Any] | None:
         """Return the values of this world for the struct in ``c/world_ticks.c``; a tick has ``count`` physics steps.
 
-        Return ``None`` if C cannot simulate this world, because the readings are delayed, or because a joint is not a
-        floating base, a hinge or a slide.
+        Return ``None`` if C cannot simulate this world.  C supports neither delayed readings nor joints other than a
+        floating base, hinges and slides.
         """
         self._check_ready()
         places, sample, floating = self._layout.places, self._past[-1], self.robot.floating

@@ -98,7 +98,8 @@ def build_scene(robot: Robot, scene: Scene, q: Array, throw: Throw | None = None
     hulls, rotor_link = _add_rotor_link(mjcf, robot)
     links = add_link_geoms(mjcf, robot)
     if robot.floating:
-        # A link with a shape of the scenario touches surfaces only with this shape.  A surface may cut a fixed base.
+        # A link with a shape of the scenario touches surfaces only with this shape.  Links of a robot with a fixed
+        # base do not touch surfaces, because a surface may cut the base.
         shaped = {WORLD, *(point_on(robot, shape.frame).joint for shape in scene.shapes)}
         hulls += [geom for geom, link in links.items() if link.joint not in shaped]
     for surface in scene.surfaces:
@@ -117,8 +118,8 @@ def build_scene(robot: Robot, scene: Scene, q: Array, throw: Throw | None = None
 def _add_rotor_link(mjcf: Mjcf, robot: Robot) -> tuple[list[str], Array]:
     """Add the hulls of the link that carries the rotors, with their disks.
 
-    Return the names of the geoms, and the points of :attr:`BuiltScene.rotor_link`.  Surfaces are planes, so the hull
-    of a shape touches a surface where the shape does.
+    Return the names of the geoms, and the points of :attr:`BuiltScene.rotor_link`.  Surfaces are planes, so a shape
+    and its hull touch a surface at the same points.
     """
     propulsion, names, points = robot.spec.propulsion, [], [np.zeros((0, 3))]
     shapes = [] if propulsion is None else read_shapes(robot)[0]
