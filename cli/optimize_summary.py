@@ -173,7 +173,7 @@ def _path(page: Page, path: dict[str, Any]) -> None:
         after = strike["follow_through"]
         stops = f"then stops within {number(after['longest_s'])} s after {after['stopped']}"
         page.line(
-            f"  {stops if after['stopped'] else 'cannot stop after any'} of {after['impacts']} "
+            f"  {stops if after['stopped'] else 'no stop along the velocity exists after any'} of {after['impacts']} "
             f"considered impacts (restitution {RESTITUTIONS[0]:g} to {RESTITUTIONS[-1]:g}, "
             f"{FACTORS[0]:.0%} to {FACTORS[-1]:.0%} of the speed)"
         )

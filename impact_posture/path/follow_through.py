@@ -168,9 +168,9 @@ def _stop(impact: str, spaces: StrikeSpaces, q: Array, velocity: Array, limits: 
     velocity = velocity - np.linalg.pinv(held, rcond=1e-9) @ (held @ velocity)
     stroke, duration = shortest_stroke(space, q, velocity, spaces.rows(space), limits, before=False)
     if stroke.curve is None:
-        return f"no stop is possible, because of {stroke.end}"
+        return f"no stop along the velocity exists, because of {stroke.end}"
     if duration is None:
-        return f"no stop is possible, because of {stroke.hindrance(limits, 1.0)}"
+        return f"no stop along the velocity exists, because of {stroke.hindrance(limits, 1.0)}"
     return _Stop(impact, stroke.curve, stroke.law(duration), duration)
 
 

@@ -25,7 +25,7 @@ from impact_posture.system.arrays import Array
 
 # Why a path that was reached is not returned.
 _NOT_SMOOTH = "no smooth curve through the path satisfies the constraints"
-_EVERYWHERE = "velocity limits and position limits of the joints in every posture of the search"
+_EVERYWHERE = "velocity limits, joint limits and other constraints in every posture of the search"
 # Largest number of optima to try, best first.
 _OPTIMA = 5
 # An optimum with a larger objective is struck instead if its speed exceeds the greatest speed so far by this factor.

@@ -109,10 +109,12 @@ def _tipping(problem: ConstrainedProblem, model: Numeric) -> Array:
     if over is None:
         return np.zeros((0, model.model.nv))
     beyond, jacobian = over.evaluate(model)
+    # If a bound without margin is active, the center of mass can be at the edge.
+    room = np.maximum(-beyond, _ACTIVE)
     feet = [point_on(problem.robot, s.frame, s.offset) for s in problem.objective.supports]
     height = model.center_of_mass()[0][2] - np.mean([model.placement(foot).translation[2] for foot in feet])
     gravity = np.linalg.norm(problem.robot.model.gravity.linear)
-    return np.asarray(jacobian / (-beyond * np.sqrt(gravity / height))[:, None])
+    return np.asarray(jacobian / (room * np.sqrt(gravity / height))[:, None])
 
 
 def impact_velocity(

@@ -35,7 +35,8 @@ _FASTER = 3.0
 _DEFLECTED = 0.01
 # Singular values below this share of the largest one are zero.
 _RANK = 1e-9
-# Shortest duration of a stroke, s, which a controller can follow: without rotors, and with rotors, whose thrust lags.
+# Shortest duration of a run-up, s, which a controller can follow: without rotors, and with rotors, whose thrust lags.
+# A stop is shorter only if it must be.
 SHORTEST = (RUN_UP, 0.2)
 # Ratio of successive trial durations of a stroke.
 _LONGER = 1.3
@@ -143,7 +144,9 @@ class Stroke:
 
     def shortest(self, limits: ActuatorLimits, factor: float = 1.0) -> float | None:
         """Return the shortest duration within the limits, s; ``None`` if the curve is too short for any."""
-        most = 2 * self.time / factor
+        most = self._longest(factor)
+        if self._too_short(limits, factor):
+            return None
 
         def works(duration: float) -> bool:
             return self.need(limits, duration, factor, stop=True).share <= 1
@@ -158,12 +161,19 @@ class Stroke:
             low, high = (low, middle) if works(middle) else (middle, high)
         return high
 
+    def _longest(self, factor: float) -> float:
+        return 2 * self.time / factor
+
+    def _too_short(self, limits: ActuatorLimits, factor: float) -> bool:
+        return self._before and self._longest(factor) < SHORTEST[limits.rotors]
+
     def hindrance(self, limits: ActuatorLimits, factor: float) -> str:
         """Return what prevents a motion with the velocity ``factor u``: the limit with the least excess, and why."""
-        durations = np.geomspace(min(SHORTEST[0], self.time / factor), 2 * self.time / factor, 12)
-        least = min((self.need(limits, d, factor) for d in durations), key=lambda need: need.share)
         room = f", and the motion cannot be longer because of {self.end}" if self.end else ""
-        return least.of + room
+        if self._too_short(limits, factor):
+            return f"the shortest run-up of {SHORTEST[limits.rotors]:g} s{room}"
+        durations = np.geomspace(min(SHORTEST[0], self.time / factor), self._longest(factor), 12)
+        return min((self.need(limits, d, factor) for d in durations), key=lambda need: need.share).of + room
 
 
 def shortest_stroke(

@@ -25,9 +25,11 @@ from impact_posture.path.follow_through import _to_edges, after_impact, follow_t
 from impact_posture.path.path_files import read_path, write_path
 from impact_posture.path.path_space import PathSpace
 from impact_posture.path.posture_path import PosturePath, posture_path
-from impact_posture.path.strike import _RATE, StrikeSpaces, check_strike, impact_velocity
+from impact_posture.path.strike import _RATE, StrikeSpaces, _tipping, check_strike, impact_velocity
 from impact_posture.path.stroke import _SHARE
 from impact_posture.posture.approach.approach_speed import ApproachSpeed
+from impact_posture.posture.approach.attainable_speed import RUN_UP
+from impact_posture.posture.constraints.center_of_mass_over_feet import CenterOfMassOverFeet
 from impact_posture.posture.constraints.clearance import Clearance
 from impact_posture.posture.constraints.impact_bounds import ImpactBounds
 from impact_posture.posture.constraints.pose_constraints import PositionAlong
@@ -167,6 +169,18 @@ def test_a_balanced_velocity_keeps_the_capture_point_away_from_the_edges_of_the_
     assert distances[0] > distances[1] + 0.01
 
 
+def test_at_the_edge_of_the_feet_the_capture_point_does_not_move_outwards() -> None:
+    solution, path = struck("solo8")
+    problem, model = solution.problem, Numeric(solution.problem.robot.model).at(path.q[-1])
+    (over,) = (c for c in problem.constraints if isinstance(c, CenterOfMassOverFeet))
+    distances, jacobian = over.evaluate(model)
+    for distance in (-1e-12, 0.0, 1e-12):
+        edge = CenterOfMassOverFeet(over.normals, over.offsets + distances[0] - distance, 0.0)
+        others = (edge if c is over else c for c in problem.constraints)
+        row = _tipping(replace(problem, constraints=tuple(others)), model)[0]
+        assert np.isfinite(row).all() and row @ jacobian[0] > 0
+
+
 def test_links_that_are_slightly_too_near_are_separated() -> None:
     problem = prepare(make_settings({**CASES["ur5"], "contact_pose": "position"})).problem
     space, draws, near = PathSpace(problem), rng("near"), list[Array]()
@@ -205,6 +219,16 @@ def test_the_greatest_speed_of_a_cart_follows_from_its_run_up(tmp_path: Path) ->
     assert strike is not None and strike.speed == pytest.approx(greatest, rel=0.02) and strike.speed < greatest
     assert strike.hindrance == "the torque of slide, and the motion cannot be longer because of joint limits"
     assert strike.run_up_m == pytest.approx(0.1, rel=0.05) and path.found
+
+
+def test_a_run_up_is_not_shorter_than_a_controller_can_follow(tmp_path: Path) -> None:
+    """The run-up of 0.1 s to 2 m/s needs the whole room of 0.1 m."""
+    strike = posture_path(slider(tmp_path, 4000.0, 9.0), strike=5.0).strike
+    assert strike is not None and strike.contact_s - strike.run_up_s >= RUN_UP
+    assert strike.speed == pytest.approx(2.0, rel=0.02) and strike.speed <= 2.0
+    assert strike.hindrance == (
+        "the shortest run-up of 0.1 s, and the motion cannot be longer because of joint limits"
+    )
 
 
 def test_a_velocity_limit_bounds_the_speed(tmp_path: Path) -> None:
@@ -290,8 +314,8 @@ def test_a_cart_stops_before_the_end_of_its_slide_or_says_why(tmp_path: Path, ef
     duration = 1.5 * 0.6 * 2.0 / (_SHARE * effort)
     if 0.3 * duration > 0.1:
         assert after.hindrance == (
-            "no stop is possible, because of the torque of slide, and the motion cannot be longer because of joint "
-            "limits, after restitution 0.5, 120% of the speed"
+            "no stop along the velocity exists, because of the torque of slide, and the motion cannot be longer "
+            "because of joint limits, after restitution 0.5, 120% of the speed"
         )
         assert after.stopped == 6
         return
@@ -434,7 +458,7 @@ def test_a_strike_without_any_stop_is_printed(capsys: pytest.CaptureFixture[str]
     block["strike"]["follow_through"] |= {"stopped": 0, "longest_s": 0.0, "joints": None, "clearance": None}
     _path(Page(), block)
     text = " ".join(capsys.readouterr().out.split())
-    assert "cannot stop after any of 7 considered impacts" in text and "then stops" not in text
+    assert "no stop along the velocity exists after any of 7 considered impacts" in text and "then stops" not in text
 
 
 @pytest.mark.parametrize(
