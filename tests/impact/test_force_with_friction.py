@@ -125,6 +125,7 @@ def test_no_posture_exceeds_a_bound_on_the_simulated_force(friction: float) -> N
     assert stepped.force <= 0.9 * start.peak_force * 1.001
 
 
+@pytest.mark.usefixtures("few_tries")
 def test_a_bound_that_no_posture_keeps_names_the_least_force(tmp_path: Path) -> None:
     """No random feasible posture has less than the least force in the error, and this force is a valid bound."""
     task = {"robot": "tilthex_arm", "normal": (0, 0, 1), "contact_stiffness": 1e5, "approach": True}
