@@ -23,11 +23,14 @@ from impact_posture.simulation.setup import Setup, set_up
 from impact_posture.system.arrays import Array
 
 IMAGES = Path(__file__).parent / "images"
-# Scenario, and seconds before the approach.
-SCENARIO, SETTLE = "aerial-vertical", 2.5
-# The postures have equal distances on the path of the base and the joints, from the start to this time after the
-# contact, s.
-POSTURES, AFTER = 5, 0.1
+# Scenario that is drawn.
+SCENARIO = "aerial-vertical"
+# Time before the approach, s.
+SETTLE = 2.5
+# Number of drawn postures.  They have equal distances on the path of the base and the joints.
+POSTURES = 5
+# Time from the contact to the last posture, s.
+AFTER = 0.1
 # The speed is drawn from before to after the contact, s.
 SPAN = (-0.45, 0.15)
 

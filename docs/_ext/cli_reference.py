@@ -1,7 +1,6 @@
 """Directive ``cli-reference``, which describes the command line from the signatures of the commands.
 
-The directive reads the public ``OptionInfo`` of Typer.  The parser that Typer builds from it changes between
-versions.
+The directive reads the public ``OptionInfo`` of Typer, and not the parser of Typer, which changes between versions.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from pathlib import Path
 from impact_posture.system.libraries import building, cache_folder, is_cached, load_library
 from impact_posture.system.toolchain import run_compiler
 
-# Strict C and strict C++ fuse multiplications and additions only with this flag.
+# In strict C and C++, compilers fuse a multiplication and an addition only with this flag.
 CONTRACT = "-ffp-contract=fast"
 # Processor features that gcc and clang require for x86-64-v3.
 _V3 = frozenset({"avx2", "bmi1", "bmi2", "f16c", "fma", "abm", "movbe"})

@@ -37,10 +37,14 @@ HEAD = (
     "robot|states|solved|largest difference of u|over 1e-9|its own|relaxed|status differs (Python/C)|"
     "C: violation, optimality|Python's|held (C)|difference of q_r"
 ).split("|")
-# Tolerances of a correct solution: violation of hard constraints, and residual of optimality.
-HOLDS, OPTIMAL = 1e-9, 1e-7
-# Every SOME-th relaxed tick is certified.  Of the solved ticks whose controls differ, the first MOST are certified.
-SOME, MOST = 20, 500
+# Largest violation of a hard constraint by a correct solution.
+HOLDS = 1e-9
+# Largest residual of optimality of a correct solution.
+OPTIMAL = 1e-7
+# Every SOME-th relaxed tick is certified.
+SOME = 20
+# Largest number of solved ticks with different controls that are certified.
+MOST = 500
 # Robots for the measurement of memory growth.
 GROWTH = ("tilthex_arm", "panda", "solo8", "talos")
 
@@ -81,7 +85,7 @@ class Agreement:
         solved: Number of ticks that both controllers solved.
         worst: Largest relative difference between the controls in these ticks.
         differ: Number of solved ticks whose controls differ by more than 1e-9.
-        own: Largest relative change of the Python controls in these ticks if the last digits of the QP change.
+        own: Largest relative change of the Python controls in the solved ticks if the last digits of the QP change.
         relaxed: Number of ticks that both controllers relaxed.
         other: Number of ticks with different statuses, by ``Python/C``.
         held: Number of ticks in which the controller in C failed and repeated its last command.

@@ -117,7 +117,7 @@ def _cost(asked: dict[str, object], demands: dict[str, object], seeds: Sequence[
     """Search under constraints with several seeds; return an error text if a search fails."""
     solutions, starts, searches, times = list[PostureSolution](), list[float](), list[float](), list[float]()
     for seed in seeds:
-        # Time an unconstrained search for each ratio, because other work changes the speed of the machine.
+        # Each ratio has its own unconstrained search, because other programs change the speed of the machine.
         apart = solved(asked | {"seed": seed})[1]
         solution, took = solved(asked | demands | {"seed": seed})
         if not isinstance(solution, PostureSolution):

@@ -23,8 +23,12 @@ from impact_posture.robot.robot import Robot
 from impact_posture.system.processes import fork_map
 from impact_posture.tsid.flow.flow_direction import FlowOptions
 
-# Times, s: goal for coming to rest, end of a flow that does not rest, and duration of a flow with smaller steps.
-REST, LONGEST, FINE = 8.0, 16.0, 5.0
+# Goal for the time until the flow comes to rest, s.
+REST = 8.0
+# A flow that does not rest ends after this time, s.
+LONGEST = 16.0
+# Duration of a flow with smaller steps, s.
+FINE = 5.0
 FINER = FlowOptions(rho=0.0, mu=0.005, epsilon=1e-7)
 # Values of H count as equal if their difference, divided by H at the start, is below this number.
 CLOSE = 0.01
@@ -128,8 +132,8 @@ def _row(case: Case, count: int, request: Request) -> list[str]:
         course = flow.course(starts[index], LONGEST, FlowOptions())
         start, end = course.values[[0, -1]]
         record, certificate = run_start(nlp, course.q, float(end))
-        # The program does not limit actuators and tilt, so check both.  If a start tilts more than the limit, the
-        # flow must not tilt further.
+        # The offline program does not limit actuators and tilt, so both are checked here.  If the start tilts more
+        # than the limit, the flow must not tilt further.
         tilted = max(FlowOptions().tilt, _tilt(robot, course.q))
         fits = certificate.holds() and flow.share(record.q) < 1.001 and _tilt(robot, record.q) < tilted + 0.001
         away = np.abs(pin.difference(robot.model, course.q, record.q)[robot.first_joint :]).max()

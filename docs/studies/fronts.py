@@ -11,7 +11,8 @@ from impact_posture.collision.contact_front import ContactFront, contact_front
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import known_robots, load_robot
 
-# Axes of contact frames along which tools point. A base has none, because it may be pushed from every side.
+# Contact frame → axis of this frame along which the tool points.  A base has no such axis, because it may be pushed
+# from every side.
 FORWARD = {
     "anymal_kinova": {"j2s6s200_end_effector": "x"},
     "borinot": {"flying_arm_2__ee": "x"},

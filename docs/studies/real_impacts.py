@@ -103,7 +103,7 @@ def result(scenario: str, name: str) -> dict[str, Any]:
 def lines(request: Request) -> Iterator[str]:
     """Yield a table for each scenario."""
     controllers = [c for c in COMPARED if c in CONTROLLERS]
-    # At other speeds, run only the nominal controller and those whose posture depends on the speed or the impulse.
+    # At other speeds, only the nominal controller runs, and the controllers for which the objective matters.
     others = [c for c in controllers if c.endswith(("nominal", "robust", "sticking"))]
     pairs = [(s, c) for s in SCENARIOS if request.only in s for c in (others if " " in s else controllers)]
     answers = collected(lambda k: result(*pairs[k]), len(pairs), request.jobs, "runs")

@@ -42,8 +42,10 @@ from impact_posture.system.escape import toml
 
 # Wall time of one robot, s.
 LIMIT = 600
-# Largest violation, and largest difference of the objective, relative to the start, after the posture was read.
-_VIOLATION, _SAME = 1e-6, 1e-9
+# Largest violation of a constraint by the posture that was read.
+_VIOLATION = 1e-6
+# Largest difference of the objective after the posture was read, relative to the objective at the start.
+_SAME = 1e-9
 # Shortest distance (m) of a joint from the contact point that gives the direction of a link.
 _SHORT = 0.05
 # Packages with MJCFs of robots → the folder of these robots in the package.

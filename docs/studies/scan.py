@@ -30,9 +30,12 @@ from impact_posture.simulation.world.world import build_world
 
 ARM, HUMANOID = "aerial-vertical", "talos-push"
 PICTURE = ROOT / "docs" / "images" / "where-bracing-helps.png"
-# Bend of the elbow at the start of the shipped scenario, and largest bend in the scan, rad.
-_SHIPPED, _LARGEST = 0.9, 1.5
-# Time before the push, s.  It can be short, because the humanoid starts in the posture that the controller keeps.
+# Bend of the elbow at the start of the shipped scenario, rad.
+_SHIPPED = 0.9
+# Largest bend of the elbow in the scan, rad.
+_LARGEST = 1.5
+# Time before the push, s.  A short time suffices, because the humanoid starts in the posture that the controller
+# keeps.
 _SETTLE = 1.0
 # The line of the jump is dashed, because for a push it coincides with the line of the motion.
 _JUMP = {"color": GREEN, "linestyle": (0, (2, 2)), "linewidth": 1.6, "zorder": 3.2}

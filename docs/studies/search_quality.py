@@ -33,10 +33,14 @@ from impact_posture.robot.robot_loader import known_robots, load_robot
 from impact_posture.robot.robot_spec import ContactSpec, RobotSpec
 from impact_posture.system.libraries import cache_folder
 
-# Number of random arms.  The constants of the search were chosen with the first of them, and not with the others.
-_ARMS, _TUNED = 76, 60
-# Number of independent starts for the best known objective of a case, and their seed.
-_MANY, _OTHER_SEED = 1024, 1000
+# Number of random arms.
+_ARMS = 76
+# The constants of the search were chosen with the first arms up to this number, and not with the others.
+_TUNED = 60
+# Number of independent starts for the best known objective of a case.
+_MANY = 1024
+# Seed of these starts.
+_OTHER_SEED = 1000
 # An objective within this share of the best known one counts as reached.
 _REACHED = 0.01
 # Goals: share of runs that reach the best known objective, and median time divided by the time of 16 starts.

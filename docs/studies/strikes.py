@@ -39,8 +39,14 @@ CASES = (
 )  # fmt: skip
 CONTROLLERS = ("strike", "nominal", "robust-flow")
 SPREAD = Spread(speed=0.1, normal=5.0, gap=0.005)
-# Bars: share of the stated speed, s, s, and share of the predicted jump.
-SPEED, INSTANT, SATURATED, RATIO = 0.05, 0.01, 0.0, 0.15
+# Largest error of the speed, as a share of the stated speed.
+SPEED = 0.05
+# Largest error of the time of the contact, s.
+INSTANT = 0.01
+# Longest time at an actuator limit, s.
+SATURATED = 0.0
+# Largest error of the jump, as a share of the predicted jump.
+RATIO = 0.15
 HEAD = (
     "controller", "contact speed, error in %", "contact instant, error in ms", "saturated before, ms",
     "measured / predicted jump", "jump, of nominal", "completed", "bars missed",
@@ -69,7 +75,7 @@ def struck(case: str, name: str, seed: int, offline: Callable[..., OfflinePostur
     except ImpactPostureError as error:
         return {"status": "no answer", "why": error.line, "plan": None, "contact": None}
     (window,), (part,), reference = record.of("impact"), document["runs"], Reference(task, setup.gap)
-    # The surface is farther than expected by this distance, m.
+    # A point of the expected surface and a point of the true surface.
     stated, true = (each.world.built.points[task.surface] for each in (set_up(scenario), setup))
     due = reference.start(0) + reference.crossing + scenario.normal @ (stated - true) / task.speed
     before = record.series.slice(reference.start(0), window.begin)
@@ -156,9 +162,12 @@ def _notes(runs: list[dict[str, Any]]) -> Iterator[str]:
         yield f"planned run-up of {length:.0f} mm{most}; can stop after {stops} impacts{why}"
 
 
-# Scenarios, and delays (s) of contacts that are early or late; after REST (s), the contact point is at rest.
+# Scenarios in which the contact is early or late.
 INSTANTS = ("panda-tap", "ur5-strike", "aerial-vertical", "g1-strike 0.5", "talos-strike 0.5")
-LATE, REST = (-0.05, -0.02, 0.0, 0.02, 0.05), 0.25
+# Delays of the contact, s.
+LATE = (-0.05, -0.02, 0.0, 0.02, 0.05)
+# Time from the contact to the measurement of the speed after the stop, s.
+REST = 0.25
 INSTANTS_HEAD = (
     "scenario", "contact, ms late", "its speed, m/s", "planned speed then, m/s", "measured / predicted jump",
     "at a limit in the run-up, ms", "after the contact, ms", f"speed {REST:g} s later, m/s", "outcome",

@@ -161,7 +161,7 @@ def _ticks(name: str, robot: Robot, gradient: Gradient, request: Request) -> lis
     nominal, robust, flow, often = flights = [Flight(amplitude, robot, posture) for posture in postures]
     gc.collect()
     for k in range(request.count):
-        # Run the controllers in turn, so that all are disturbed equally by other programs.
+        # The controllers run in turn, so that other programs disturb all of them equally.
         for flight in flights:
             flight.tick(k)
     middle, late, ratio = robust.usual[0], np.percentile(robust.took, 99), robust.usual / nominal.usual

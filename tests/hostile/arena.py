@@ -25,8 +25,10 @@ CODES = {0, 1, 2, 3, 4, 130, 143}
 USAGE = ("Usage: ", "Try ", "Error: ")
 # Texts that the program itself never prints, but libraries and interpreters do.
 NOISE = ("Traceback", "internal error", "Warning:", "Exception ignored", "terminate called", "Segmentation", "DEBUG")
-# Permitted processor time of an attack (s), and the duration after which an attack is treated as hanging (s).
-BUSY, PATIENCE = 60, 120
+# Permitted processor time of an attack, s.
+BUSY = 60
+# Time after which an attack is treated as hanging, s.
+PATIENCE = 120
 
 SMALL = """<robot name="small">
   <link name="world_link"/>

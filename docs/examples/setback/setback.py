@@ -1,4 +1,4 @@
-"""Controller for the experiments, defined in a separate package, that bends the last joint before the impact."""
+"""A controller for the experiments in a separate package: it bends the last joint before the impact."""
 
 from __future__ import annotations
 

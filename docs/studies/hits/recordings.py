@@ -28,15 +28,20 @@ _QUANTITIES = {
     "effort": ("JointEffort", "tau"),
     "command": ("TorqueCmd", "tau_cmd"),
 }
-# Rows that are kept before and after the contact of a CSV file.
-_BEFORE, _AFTER = 7, 14
+# Number of rows of a CSV file that are kept before the contact.
+_BEFORE = 7
+# Number of rows that are kept after the contact.
+_AFTER = 14
 # Number of rows before the braking in which the contact is searched.
 _BRAKED = 14
-# The recorded velocity is filtered with dq[k] = 0.8 dq[k-1] + 0.2 Δq/5 ms, so it lags by four samples, and its
-# variance is 1/9 of the variance of Δq/5 ms.
-_LAG, _WEIGHT = 4.0, 9.0
-# Number of intervals before the contact from which the trend is fitted, and number from which they suffice.
-_TREND, _ENOUGH = 6, 3
+# Lag of the recorded velocity, in samples: it is filtered with dq[k] = 0.8 dq[k-1] + 0.2 Δq/5 ms.
+_LAG = 4.0
+# Variance of Δq/5 ms divided by the variance of the recorded velocity.
+_WEIGHT = 9.0
+# Number of intervals before the contact from which the trend is fitted.
+_TREND = 6
+# Number of intervals that suffice for the fit.
+_ENOUGH = 3
 # Averaged intervals after the contact row by box.  The light box leaves the tip after some 10 ms, the heavy box after
 # some 25 ms.
 AVERAGED = {1: (2, 4), 2: (5, 7)}
@@ -64,7 +69,7 @@ class Hit:
         q: Joint positions, rad, shape (k, 7).
         dq: Recorded joint velocities, filtered, rad/s, shape (k, 7).
         torque: Torques that the sensors measure between drives and links, N·m, shape (k, 7), with gravity.  The sign
-            is the sign of ``command``.
+            convention is the same as for ``command``.
         command: Commanded torques without gravity, N·m, shape (k, 7).
     """
 

@@ -103,7 +103,8 @@ class Evaluation:
         return scores
 
     def impulses(self, group: Group) -> tuple[float, float, float]:
-        """Return the impulse along the tool axis from the joint torques, as predicted by ``reflected``, and a mass.
+        """Return two impulses along the tool axis, from the joint torques and as predicted by ``reflected``, and a
+        mass.
 
         The measured torques and the momentum of the links determine the impulse without controller, restitution and
         mass of the box: ``M Δq̇ − ∫Δτ dt = −(j p + moments)``.  The inertia of links and rotors only weighs the least

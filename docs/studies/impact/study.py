@@ -35,7 +35,8 @@ STUDIED: dict[str, tuple[Case, str, str]] = {
         ("hextilt, wall", "position", "flies as one body, the arm's end against a wall"),
     )
 }
-# Friction coefficients: no friction, ice, two ordinary surfaces, and a surface on which nothing slides.
+# Friction coefficients of a surface without friction, of ice, of two ordinary surfaces, and of a surface on which
+# nothing slides.
 FRICTIONS = (0.0, 0.1, 0.3, 0.8, np.inf)
 # Other variations of an impact: description, and surface; the friction is set later.
 VARIATIONS = (

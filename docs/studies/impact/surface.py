@@ -16,21 +16,25 @@ from impact_posture.impact.impact_contact import point_on
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.system.optional_package import import_mujoco
 
-# Number of simulation steps in one time constant of the contact, and number of time constants after which the study
-# stops waiting for the end of the contact.
-_FINE, _PATIENCE = 50, 40
-# Ratio of two rates: how fast friction and supports stop a velocity, over the rate of the contact.  Then a friction
-# coefficient that prevents sliding.
-_GRIP, _STICKY = 10.0, 10.0
+# Number of simulation steps in one time constant of the contact.
+_FINE = 50
+# Number of time constants after which the study stops waiting for the end of the contact.
+_PATIENCE = 40
+# Rate at which friction and supports stop a velocity, divided by the rate of the contact.
+_GRIP = 10.0
+# Friction coefficient that prevents sliding.
+_STICKY = 10.0
 # Friction coefficient that replaces an infinite coefficient in a prediction.
 _STICKS = 1e6
 # Number of iterations for Coulomb's law within one step.
 _INNER = 20
 # Number of steps without a force after which the contact has ended.
 _QUIET = 5
-# Radius of the ball that touches at the contact point, m; the value is arbitrary.  Initial height of the contact
-# point above the plane, m, so that all postures touch after the same fraction of a time step.
-_BALL, _GAP = 0.01, 1e-6
+# Radius of the ball that touches at the contact point, m.  The value is arbitrary.
+_BALL = 0.01
+# Initial height of the contact point above the plane, m.  With this height, all postures touch after the same
+# fraction of a time step.
+_GAP = 1e-6
 # Parameters of the stiffest constraint that MuJoCo accepts, independent of the depth.
 _SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
 

@@ -172,9 +172,9 @@ class Harness:
             if kind != "value":
                 scale = np.maximum(np.abs(gradient).max(axis=1), 1e-3 * np.abs(H))
                 errors.append((np.abs(own - gradient).max(axis=1) / scale).max())
-            # np.max returns NaN if an entry is NaN, but max() may ignore it.
+            # np.max returns NaN if an entry is NaN, but the built-in max may ignore NaN.
             worst = float(np.max(errors))
-        # The condition is not written with ">", which is false for NaN.
+        # The condition is not written with ">", because a comparison with NaN is false.
         if not worst <= (1e-5 if kernel.group == "differences" else 1e-6):
             raise Disagreement(f"its numbers differ from Pinocchio's by {worst:.1e}, relative")
         return worst

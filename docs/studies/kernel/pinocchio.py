@@ -19,8 +19,8 @@ DEFINITIONS = (
     "BOOST_MPL_LIMIT_LIST_SIZE=30", "BOOST_MPL_LIMIT_VECTOR_SIZE=30", "BOOST_MPL_CFG_NO_PREPROCESSED_HEADERS",
     "BOOST_FUSION_INVOKE_MAX_ARITY=12", "FUSION_MAX_VECTOR_SIZE=12", "NDEBUG",
 )  # fmt: skip
-# With the default limits of GCC, the inlining of one formulation depends on the others, which changes its time by up
-# to a fifth.
+# With the default limits of GCC, the inlining of a formulation depends on the other formulations.  This changes the
+# time of a formulation by up to a fifth.
 _INLINE = ("inline-unit-growth=400", "large-function-growth=2000", "large-stack-frame-growth=10000")
 _PARAMETERS = [*[f"--param={p}" for p in _INLINE], *[f"-D{d}" for d in DEFINITIONS]]
 _FLAGS = ("-std=c++17", "-O3", "-march=native", CONTRACT, *_PARAMETERS)

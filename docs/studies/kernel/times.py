@@ -82,7 +82,7 @@ def measure(samples: Samples, rounds: int, peers: Sequence[str] = tuple(PEERS)) 
     say(f"{robot.name}: {rounds} rounds")
     times = harness.times([kernel for kernel, _ in right], rounds)
     rows = [(kernel, timed, error) for (kernel, error), timed in zip(right, times, strict=True)]
-    # Of our builds with finite differences, keep only the fastest.
+    # Only the fastest of our builds with finite differences is kept.
     differences = {kernel.name: t["differences"] for kernel, t, _ in rows if "differences" in t}
     slower = sorted(differences, key=lambda name: differences[name])[1:]
     return Report(samples, [row for row in rows if row[0].name not in slower], skipped)

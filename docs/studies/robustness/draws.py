@@ -20,9 +20,11 @@ from impact_posture.simulation.seed_variation import stand
 from impact_posture.simulation.setup import Setup, set_up
 from impact_posture.simulation.world.world import build_world
 
-# To save time, every point has fewer contacts and shorter pauses (s) than the scenario files.  A push waits at most
-# PATIENCE seconds for the robot to rest.
-COUNT, DWELL, PAUSE = 2, 0.4, 0.6
+# Number of contacts at a point.  To save time, it is smaller than in the scenario files.
+COUNT = 2
+# Time at the surface and pause between contacts, s, also shorter than in the scenario files.
+DWELL, PAUSE = 0.4, 0.6
+# Longest time for which a push waits for the robot to rest, s.
 PATIENCE = 5.0
 # Factor from a friction coefficient to a pyramid inside the cone with a margin of 10 %, as in the scenario files.
 _TRUST = 0.9 / math.sqrt(2)

@@ -40,7 +40,7 @@ class Summary:
         motion: Quartiles of the relative change of the motion in the impact windows; infinite for failed runs.
         recovery: Quartiles of the relative change of the motion during the recovery.
         jump: Median relative change of the peak jump.
-        force: Median and largest peak force, divided by the nominal controller's.
+        force: Median and largest peak force, each divided by the peak force with the nominal controller.
         saturation: Time at a limit over all runs that did not fail, s, inside and outside the windows.
         failures: For each status, number of points at which the controller failed with this status.
     """

@@ -16,8 +16,10 @@ from docs.studies.core import Vector
 # Tangential creep of a contact that sticks, as a share of its mobility.  It selects the forces of soles whose corners
 # hold more directions than the sole can move in.
 _CREEP = 1e-4
-# Relative error of a solved step, and number of Newton steps after which it counts as unsolved.
-_TOLERANCE, _NEWTON = 1e-9, 30
+# Relative error of a solved step.
+_TOLERANCE = 1e-9
+# Number of Newton steps after which a step counts as unsolved.
+_NEWTON = 30
 
 
 class CoulombStep:

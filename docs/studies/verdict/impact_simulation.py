@@ -22,12 +22,16 @@ import scipy.optimize
 from docs.studies.core import Vector
 from docs.studies.verdict.coulomb_step import CoulombStep
 
-# Number of time steps in the shortest possible compression time, and the longest time step, s.
-_STEPS, _LONGEST = 150, 5e-5
-# The simulation gives up after this many times the shortest possible compression time.
+# Number of time steps in the shortest possible compression time.
+_STEPS = 150
+# Longest time step, s.
+_LONGEST = 5e-5
+# The simulation ends without a result after this multiple of the shortest possible compression time.
 _PATIENCE = 60
-# Stiffness of the ground divided by the stiffness of the surface, and time after which its damping acts, in steps.
-_STIFFER, _DAMPED = 1e3, 2.0
+# Stiffness of the ground divided by the stiffness of the surface.
+_STIFFER = 1e3
+# Time constant of the damping of the ground, in time steps.
+_DAMPED = 2.0
 # A robot stands if springs under its feet balance all but this share of its weight.
 _STANDS = 1e-3
 

@@ -36,7 +36,8 @@ NUMBERS = {
 VELOCITIES = ("linear", "angular", "joint")
 # A change below this value has no sign.
 NO_CHANGE = 0.03
-# Largest relative error of the contact time from which on the feet stay, predicted and simulated up to 5 % each.
+# Largest relative error of the predicted contact time from which on the feet stay.  Prediction and simulation have
+# this time up to 5 %.
 HOLDING = 0.20
 # Reasons why a number may be beyond its bar.
 NEGLIGIBLE, MOVES_LONG = "negligible", "robot moves"

@@ -28,7 +28,7 @@ FRICTIONS = (0.0, 0.3, 1.0)
 STIFFNESSES = (1e5, 1e6)
 # In a simulation, a foot or a contact point moves if its speed is above this share of the approach speed.
 MOVES = 0.01
-# The joint that the prediction names is right if no other joint has a share of its limit that is larger by 5 %.
+# The prediction names the right joint if no other joint uses a share of its limit that is larger by more than this.
 _SAME_JOINT = 0.05
 # Accuracy of the simulated contact time from which on the feet stay.
 _HOLDING = 0.05
@@ -64,7 +64,7 @@ CASES = (
     Case("talos", BACK),
     Case("g1", BACK),
 )
-# These were tried when the simulation was finished.
+# These robots were tried only after the simulation was finished.
 HELD_OUT = (
     Case("xarm7", BACK),
     Case("kinova", DOWN),
@@ -136,7 +136,7 @@ class Pair:
         return getattr(self.predicted, number), getattr(self.still if still else self.simulated, number)
 
     def wrong_feet(self) -> list[str]:
-        """Return the feet that move in only one of both, and whose speeds differ by more than a moving foot has."""
+        """Return the feet that move in only one of prediction and simulation, and whose speeds differ clearly."""
         different = self.predicted.moving ^ self.simulated.moving
         least = MOVES * self.speed
         return sorted(f for f in different if abs(self.predicted.feet[f] - self.simulated.feet[f]) > least)
@@ -254,7 +254,7 @@ def _pair(impact: ResolvedImpact, evaluation: Evaluation, said: PredictedImpact,
             contact_velocity = oracle.at(q).J @ jump
             slips = np.linalg.norm(contact_velocity - (n @ contact_velocity) * n) > MOVES * surface.speed
         if under.forces is None:
-            # The robot is beside its feet, so the prediction does not count the weight.
+            # The center of mass is not above the feet, so the prediction does not count the weight.
             model = model.copy()
             model.gravity.linear = np.zeros(3)
     predicted = Numbers(
