@@ -30,7 +30,7 @@ static void ip_contact_rows(ip_context *c)
   }
 }
 
-/* Return whether a sole stands on its edge, that is, whether its x axis is parallel to the normal of the ground. */
+/* Return whether a sole stands on its edge: the x axis of the sole is parallel to the normal of the ground. */
 static int ip_on_edge(const ip_context *c)
 {
   int k;

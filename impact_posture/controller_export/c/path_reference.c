@@ -45,7 +45,8 @@ static void ip_path_write(ip_path *p, const double *q, const double *c, double u
   ip_exponential_rate(z, ddz, p->a);
 }
 
-/* Write the reference at the time t of a motion with n segments, each with its begin, its posture and coefficients. */
+/* Write the reference at the time t of a motion with n segments.  Each segment has a beginning, a posture and
+ * coefficients. */
 static void ip_path_follow(ip_path *p, const double *rows, int n, double end, double t)
 {
   int low = 0, high = n - 1;

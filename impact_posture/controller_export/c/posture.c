@@ -85,7 +85,7 @@ static int ip_normalize(ip_context *c)
     return 1;
   }
   /* Compute the directions that all tasks leave free.  If there are none, use the directions that contacts and strict
-   * levels leave free.  If there are none either, use all directions. */
+   * levels leave free.  If these leave no direction free, use all directions. */
   for (all = 1; all >= 0 && !redundant; --all) {
     double most;
     memset(A, 0, sizeof(double) * N * N);

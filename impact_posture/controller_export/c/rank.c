@@ -21,8 +21,8 @@ static void ip_in_units(const ip_context *c, const double *row, const double *le
   }
 }
 
-/* Decide whether the equations are independent, as LevelRank does: all singular values of the scaled rows must be
- * above 0.02.  A singular value changes at most by the norm of the change of the matrix, so most ticks need no
+/* Decide whether the equations are independent.  As in LevelRank, all singular values of the scaled rows must be above
+ * 0.02.  A singular value changes at most by the norm of the change of the matrix, so most ticks need no
  * decomposition. */
 static void ip_measure_rank(ip_context *c)
 {

@@ -10,11 +10,11 @@
 
 /* Step of the finite differences, rad. */
 #define IP_PROBE 1e-4
-/* If the step towards a posture of the path is shorter than this, rad (m), the flow continues to the next one. */
+/* If the step towards a posture of the path is shorter than this, rad (m), the flow continues to the next posture. */
 #define IP_REACHED 0.02
 /* Curvature estimates are updated only if two evaluations are at least this far apart, rad (m). */
 #define IP_MOVED 1e-6
-/* A direction that is shorter than this after its orthogonalization has large errors and is orthogonalized twice. */
+/* A direction that is shorter than this after the orthogonalization has large errors and is orthogonalized again. */
 #define IP_NEW 0.1
 /* Below this speed, rad/s (m/s), the point where the flow would stop is too near for finite differences. */
 #define IP_SLOW 1e-3
@@ -149,8 +149,8 @@ static void ip_flow_aim(ip_flow *f)
   }
 }
 
-/* Evaluate the gradient near the last evaluated posture; in every second update, at the point where the flow would
- * stop. */
+/* Evaluate the gradient near the last evaluated posture.  In every second update, evaluate it at the point where the
+ * flow would stop. */
 static void ip_flow_probe(ip_context *c)
 {
   ip_flow *f = &c->flow;
@@ -219,7 +219,7 @@ static void ip_flow_direct(ip_context *c)
   }
 #endif
   ip_flow_solve(f);
-  /* The step also decreases the distance term and the energy of the springs, but the gain counts only H. */
+  /* The step also decreases the distance term and the energy of the springs, but f->gain counts only H. */
   f->gain = fmin(f->gain * ip_flow_root(f), -ip_dot(f->slope, f->wanted, IP_NV));
   f->resting = f->gain < (f->resting ? 4.0 : 1.0) * c->p.flow_epsilon[0] || f->remains <= 0.0;
   if (f->resting) {

@@ -154,7 +154,7 @@ static void ip_flow_learn(ip_flow *f, const double *slope, const double *shares)
   }
 }
 
-/* Remove from a change of the flow the part that increases H, now or after the displacement `stop` of braking. */
+/* Remove from a change of the flow the part that increases H, here or after the displacement `stop` of braking. */
 static void ip_flow_downhill(const ip_flow *f, const double *stop, double *step)
 {
   double uphill[IP_NV], climb;
@@ -171,8 +171,8 @@ static void ip_flow_downhill(const ip_flow *f, const double *stop, double *step)
   }
 }
 
-/* Return the time in which the flow stops with constant deceleration.  At constant velocity, the motion in this time
- * would be twice the braking distance. */
+/* Return the time in which a constant deceleration stops the flow.  Without deceleration, the flow would cover twice
+ * the braking distance in this time. */
 static double ip_flow_stopping(const ip_flow *f, const ip_params *p)
 {
   return ip_largest(f->flow, 0) / p->flow_acceleration[0];

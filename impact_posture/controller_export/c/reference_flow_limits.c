@@ -1,14 +1,15 @@
 /* Limits of the reference flow: distances from the limits, and changes of the flow that do not cross them.  The
  * formulas are in impact_posture/tsid/flow/flow_direction.py. */
 
-/* Up to this violation, the flow may still move along a limit.  With IP_NEAR, it would slowly cross the limit. */
+/* The flow may move along a limit that it violates by less than this.  With the value of IP_NEAR, the flow would slowly
+ * cross the limit. */
 #define IP_SPENT 9.9e-4
 /* Distance that the flow keeps from joint limits, rad (m), and from limits of static controls, as a share. */
 #define IP_AIM 2e-3
 #define IP_RESERVE 8e-3
-/* If the squared length of a row in the free directions is smaller than this, the row is ignored. */
+/* A row of the limits is ignored if the square of its length along the free directions is smaller than this. */
 #define IP_FLAT 1e-6
-/* If the sine of the tilt is below this value, the slope of the tilt is zero, because the tilt axis is undefined. */
+/* Below this sine of the tilt angle, the tilt axis is undefined, and the slope of the tilt is set to zero. */
 #define IP_LEVEL 1e-6
 
 /* Return the largest absolute value from the entry `first` on. */

@@ -8,7 +8,8 @@
 #define IP_NEAR 1e-3
 /* Attempts per candidate of ip_flow_change: first unchanged, then twice without the part that crosses limits. */
 #define IP_ATTEMPTS 3
-/* Least share of the acceleration that the flow assumes for braking, and largest increase of this share per change. */
+/* The flow assumes a share of the largest acceleration for braking.  This share is at least IP_ABLE, and increases by
+ * at most IP_ABLE per change. */
 #define IP_ABLE 0.1
 /* Safety factor of the braking time, because the slopes of the limits change during braking. */
 #define IP_CAUTION 1.5
@@ -24,8 +25,7 @@ static void ip_shorten(double *x, double most)
   }
 }
 
-/* Compute a velocity that changes the constraints at a rate.  Of all such velocities, the result has the slowest
- * joints.  Call ip_flow_still first. */
+/* Compute the velocity with the slowest joints that changes the constraints at a rate.  Call ip_flow_still first. */
 static void ip_flow_moving(const ip_flow *f, const double *rate, double *back)
 {
   int i;
@@ -176,8 +176,8 @@ static void ip_flow_govern(ip_context *c)
   if (f->on && !f->resting && f->visited == IP_PATH) {
     f->moved += period;
   }
-  /* The flow keeps this speed until the next change.  From there on, 2/5 of the acceleration must suffice to stop the
-   * flow in the remaining time. */
+  /* The flow keeps its speed until the next change.  After that change, 2/5 of the largest acceleration must suffice to
+   * stop the flow in the remaining time. */
   f->remains = fmin(f->deadline - f->clock, p->flow_duration[0] - f->moved) - 2.0 * period;
   fastest = fmin(fastest, 0.4 * p->flow_acceleration[0] * fmax(f->remains, 0.0));
   fastest = f->on ? fastest : 0.0;

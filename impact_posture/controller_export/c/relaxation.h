@@ -4,7 +4,7 @@
  *
  * Each entry of [z; A z] has a level.  Entries of level 0 always hold.  The bounds of level 1 are exceeded only as
  * far as level 0 requires.  Then the errors of each level are minimized (least squares) without a change of the
- * errors of the levels above.  Last, the cost is minimized.  The code is C99, has no static state, allocates no
+ * errors of earlier levels.  Last, the cost is minimized.  The code is C99, has no static state, allocates no
  * memory, and has a bounded number of iterations.
  */
 #ifndef IMPACT_POSTURE_RELAXATION_H
@@ -30,7 +30,7 @@ enum {
 
 typedef struct {
     int n, m;             /* number of variables and of rows */
-    int levels;           /* number of levels below level 0; at most n + m */
+    int levels;           /* number of levels after level 0; at most n + m */
     const double *A;      /* m x n, row-major */
     const double *lower;  /* n + m: lower bounds of the variables, then of the rows */
     const double *upper;
@@ -51,7 +51,7 @@ typedef struct {
 size_t relaxation_bytes(int n, int m, int levels);
 
 /* Solve the problem, and return one of the codes above.  Write z (n numbers) if the code is positive.  `budget` is
- * the largest total number of iterations.  If it does not suffice, the next call continues from the active rows. */
+ * the largest total number of iterations.  If they do not suffice, the next call continues from the active rows. */
 int relaxation_solve(const relaxation_problem *problem, void *work, int budget, double *z, relaxation_report *report);
 
 #ifdef __cplusplus

@@ -1,6 +1,6 @@
 /* ---- least-distance programs ---------------------------------------------------------------------------------- */
 
-/* Write the rows of the program of a level: the inequalities of the levels above, and all rows of `level` as soft
+/* Write the rows of the program of a level: the inequalities of earlier levels, and all rows of `level` as soft
  * rows.  If L, the factor of the Hessian, is not null, transform the rows to whitened coordinates. */
 static void list_rows(Relaxation *r, int level, const double *L) {
     const int free = r->n - r->fixed;
@@ -136,7 +136,7 @@ static int drop_rows(Relaxation *r) {
 }
 
 /* Make the equations and the violated rows of the level the close rows.  If the level cannot hold, make the active
- * rows of the levels above the exact rows. */
+ * rows of earlier levels the exact rows. */
 static void list_held(Relaxation *r, int level, int missed) {
     clear_rows(r);
     if (missed) list_active(r);
@@ -174,7 +174,7 @@ static int finish_level(Relaxation *r, int level, int missed) {
     return find_step(r);
 }
 
-/* Minimize the error of a level without changing the errors of the levels above.  Later levels keep this error. */
+/* Minimize the error of a level without changing the errors of earlier levels.  Later levels keep this error. */
 static int solve_level(Relaxation *r, int level) {
     int missed = 0, same = 0;
     list_rows(r, level, NULL);

@@ -22,8 +22,8 @@
 #define WRONG 1e-7
 /* Largest violation of a bound in the program of the cost, relative to its unit. */
 #define ROUNDING 1e-10
-/* Relative to the length of the whole row: below the remaining length FLAT, a row is constant; PIVOT is the least
- * pivot of an elimination. */
+/* A row is constant if its remaining length is below FLAT.  PIVOT is the least pivot of an elimination.  Both are
+ * relative to the length of the whole row. */
 #define FLAT 1e-12
 #define PIVOT 1e-8
 /* Proximal terms relative to the largest diagonal entry of the Hessian, in the order of the attempts. */

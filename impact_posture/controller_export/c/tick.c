@@ -1,13 +1,13 @@
 /* Functions of the header: reset, tick, and changes of targets and phases. */
 
-/* Largest time step of ramps, in periods.  A tick after a long pause would otherwise end a ramp. */
+/* Largest time step of ramps, in periods.  Without it, a tick after a long pause would end a ramp. */
 #define IP_LONGEST 10.0
-/* A measurement is invalid if the sum of its squares exceeds this value (numbers of about 1e8 m, rad/s or N). */
+/* A measured vector is invalid if the sum of its squared entries exceeds this value.  Its root is 1e8 m, rad/s or N. */
 #define IP_ABSURD 1e16
 /* Times with a smaller difference, s, are equal, because sums of periods are not exact. */
 #define IP_SAME 1e-9
 
-/* Return whether a quaternion, or a cosine with its sine, is far from unit length. */
+/* Return whether a quaternion or a pair (cosine, sine) in q is far from unit length. */
 static int ip_turned_wrong(const double *q)
 {
   int k;

@@ -1,5 +1,5 @@
-/* Ticks of a simulated world with a controller in C.  The code computes the same as the class World in world.py, with
- * the sensors of sensor_noise.py, the propellers of rotors.py and the contacts of contact_forces.py.  These Python
+/* Ticks of a simulated world with a controller in C.  The results are the same as with the class World in world.py,
+ * with the sensors of sensor_noise.py, the propellers of rotors.py and the contacts of contact_forces.py.  These Python
  * files explain the terms. */
 #include <math.h>
 #include <string.h>
@@ -186,7 +186,7 @@ static void measure(const world *w, const double *noise)
     if (w->floating) {
       move_base(q, noise);
     }
-    /* Each joint has one value.  A base has 7 values in q and 6 in v, so a joint has the index k + 1 in q. */
+    /* Each joint has one value.  A base has 7 values in q and 6 in v, so joint k of v has the index k + 1 in q. */
     for (k = 6 * w->floating; k < w->nv; ++k) {
       q[k + w->floating] += noise[k];
     }
@@ -340,7 +340,7 @@ static int refuses(const world *w)
   return 0;
 }
 
-/* Run at most `ticks` ticks.  Return how many ticks ran before the state diverged or a command was invalid. */
+/* Run at most `ticks` ticks.  Return the number of ticks before the state diverged or a command was invalid. */
 int world_ticks(world *w, int ticks)
 {
   const int targets = w->targets;
