@@ -35,8 +35,8 @@ _LEAST_ROWS = 256
 class ImpactGradient:
     """Compute ``H``, its tangent gradient and related quantities with a compiled export.
 
-    Every method copies its inputs into buffers that were allocated once.  **Array results are views of buffers, and
-    the next call of the same method overwrites them.**  Copy a result if you need it after the next call.  Use an
+    Every method copies its inputs into buffers that were allocated once.  **Array results are views of buffers.  The
+    next call of the same method overwrites them.**  Copy a result if you need it after the next call.  Use an
     object in one thread only; :meth:`copy` returns an object for another thread.  Calls release the global
     interpreter lock.
 
@@ -178,7 +178,7 @@ class ImpactGradient:
         return results
 
     def value_and_gradient(self, q: ArrayLike, n: ArrayLike) -> tuple[float, Array]:
-        """Return ``H`` and its tangent gradient, a view of shape (nv,), with ``q`` and ``n`` as in :meth:`call`."""
+        """Return ``H`` and its tangent gradient, a view of shape (nv,), at ``q`` and ``n`` (see :meth:`call`)."""
         # Control loops call this method in every tick, so it does not use the slower self._results.
         code, (H, gradient) = self.call("eval", q, n)
         if code:

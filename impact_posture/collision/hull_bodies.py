@@ -34,9 +34,9 @@ class Body(NamedTuple):
 def merged_bodies(shapes: Sequence[pin.GeometryObject], apart: NDArray[np.bool_]) -> list[Body]:
     """Merge shapes of a robot into bodies, so that fewer pairs of bodies must be checked for collisions.
 
-    Two bodies are merged on three conditions: they have the same joint, they must stay apart from the same shapes,
-    and every point of their common hull is within 1 cm of one of the bodies.  ``apart``, shape (n, n), tells whether
-    two shapes must not touch.
+    Two bodies are merged if they have the same joint and must stay apart from the same shapes.  Also, every point of
+    their common hull must be within 1 cm of one of the bodies.  ``apart``, shape (n, n), tells whether two shapes
+    must not touch.
     """
     corners = [
         hull_corners(shape_points(shape.geometry) @ shape.placement.rotation.T + shape.placement.translation)

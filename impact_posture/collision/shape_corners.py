@@ -1,9 +1,9 @@
 """Corners and triangles of coal shapes, with a correction of triangles that coal reads wrongly.
 
 A node of a mesh file may have several parts, one for each material.  coal 3.0 stacks the corners of all parts, but
-numbers the triangles of every part from the first corner of the node.  The triangles of a part begin with its corners
-0, 1 and 2 and use all its corners, so this module can detect the parts and check the result.  If the check fails, the
-convex hull of the corners, which contains the mesh, replaces the mesh.
+numbers the triangles of every part from the first corner of the node.  The triangles of a part begin with the corners
+0, 1 and 2 of the part and use all its corners.  Therefore, this module can detect the parts and check the result.  If
+the check fails, the convex hull of the corners, which contains the mesh, replaces the mesh.
 """
 
 from __future__ import annotations

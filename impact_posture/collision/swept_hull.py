@@ -68,7 +68,7 @@ class SweptHull:
 
     @cached_property
     def faces(self) -> Array:
-        """Triangles of the hull as indices into ``vertices``, shape (n, 3); none for a point or a segment."""
+        """Triangles of the hull as indices into ``vertices``, shape (n, 3); a point or a segment has no triangles."""
         if self.known_faces is not None:
             return self.known_faces
         if len(self.vertices) < 4:

@@ -277,8 +277,8 @@ class CompiledController:
                 before the impact.
 
         Raises:
-            InputError: This phase cannot follow the present phase, ``t`` is before the time of a phase that has not
-                begun yet, ``t_impact`` is not finite, or a controller without a flow gets ``t_impact``.
+            InputError: This phase cannot follow the present phase, or ``t`` is before the time of a phase that has
+                not begun yet.  Or ``t_impact`` is not finite, or is given to a controller without a flow.
         """
         if t_impact is None:
             self._enter("brace", t)

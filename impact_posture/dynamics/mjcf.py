@@ -127,12 +127,12 @@ def pose(placement: pin.SE3) -> dict[str, Array]:
 def build_mjcf(model: pin.Model, name: str = "robot") -> Mjcf:
     """Build the MuJoCo model of a Pinocchio model.
 
-    A body has the name of the link at its origin, or else the name of its joint.  Every frame becomes a site with the
-    name of the frame.  If a link and a joint have the same name, the site is at the frame of the link.  A free-flyer
-    whose parent is the world becomes a free joint.  Any other free-flyer becomes three slides and a ball.  A planar
-    joint becomes two slides and a hinge, and a translation becomes three slides.  A body without mass gets the
-    smallest mass and moments of inertia that MuJoCo accepts.  The model has no friction, damping or effort limits,
-    because the dynamics of Pinocchio do not include them.
+    A body has the name of the link at its origin; without a link, it has the name of its joint.  Every frame becomes
+    a site with the name of the frame.  If a link and a joint have the same name, the site is at the frame of the
+    link.  A free-flyer whose parent is the world becomes a free joint.  Any other free-flyer becomes three slides and
+    a ball.  A planar joint becomes two slides and a hinge, and a translation becomes three slides.  A body without
+    mass gets the smallest mass and moments of inertia that MuJoCo accepts.  The model has no friction, damping or
+    effort limits, because the dynamics of Pinocchio do not include them.
 
     Raises:
         UnsupportedJoint: The joint type cannot occur in a URDF.

@@ -21,9 +21,8 @@ from impact_posture.system.optional_package import import_mujoco
 class MujocoNumeric:
     """Compute dynamics of a robot with MuJoCo at one configuration.
 
-    The model is the MJCF from which the robot was loaded.  In three cases, the model is the result of
-    :func:`build_mjcf`: the robot comes from a URDF, its settings contain a ``mounting``, or one of the ``frames`` is
-    the frame of a joint.
+    The model is the MJCF from which the robot was loaded.  The result of :func:`build_mjcf` replaces this model if
+    the robot comes from a URDF, its settings contain a ``mounting``, or a frame in ``frames`` belongs to a joint.
 
     The method :meth:`at` sets the configuration and must be called first.  All vectors and matrices are in the order
     and tangent space of Pinocchio.  Joints with an infinite armature get an armature of zero.

@@ -297,7 +297,7 @@ class Tree(Kinematics):
 
         The gradient is ``Sᵀ(v_y⁻ ×* f_x + v_x⁻ ×* f_y)`` with ``f = I^a v⁻ + p^a``.  Wrenches that are constant in
         the world rotate relative to the links and add a term (:meth:`_turn`).  For a joint about a coordinate axis,
-        the two terms with ``I^a`` equal the product ``v_y⁻ᵀ K v_x⁻``, where ``K`` is the derivative of ``I^a`` with
+        the two terms with ``I^a`` equal the product ``v_y⁻ᵀ K v_x⁻``.  ``K`` is the derivative of ``I^a`` with
         respect to the joint angle.
         """
         turning: ByJoint = {}
@@ -317,7 +317,7 @@ class Tree(Kinematics):
     def energy_gradient(self, velocities: ByJoint) -> ca.SX:
         """Return the tangent gradient of ``vᵀM(q)v`` for fixed ``v``, without extra inertias, shape (nv,).
 
-        Entry j is ``−2 S_jᵀ (v_j⁻ ×* F_j)``.  ``F_j`` is the momentum of the subtree of joint j, and ``v_j⁻`` is the
+        Entry j is ``−2 S_jᵀ (v_j⁻ ×* F_j)``.  ``F_j`` is the momentum of the subtree of joint j.  ``v_j⁻`` is the
         velocity of the link after joint j without the motion of joint j.
         """
         forces = {i: -2 * (self._own_inertia[i] @ velocity) for i, velocity in velocities.items()}

@@ -86,8 +86,8 @@ def thrust_limits(propulsion: PropulsionSpec) -> tuple[float, float]:
 def torque_limits(model: pin.Model) -> Array:
     """Return the largest torque of each velocity entry, N·m or N, shape (nv,).
 
-    The torque is infinite for a floating base, for a locked joint (infinite armature), and for a joint whose limit is
-    zero, because zero means that the file states no limit.
+    The torque is infinite for a floating base and for a locked joint (infinite armature).  It is also infinite for a
+    joint whose limit is zero, because zero means that the file states no limit.
     """
     limits = np.array(model.effortLimit, dtype=float)
     unknown = ~(np.isfinite(limits) & (limits > 0)) | finite_armature(model)[1]

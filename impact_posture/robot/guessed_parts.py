@@ -69,8 +69,8 @@ def upright_frames(robot: Robot) -> pin.Data:
 def feet(robot: Robot, named: Sequence[str] = ()) -> tuple[str, ...]:
     """Return frames that are probably feet.
 
-    The first non-empty choice is used: the frames ``named`` by the SRDF, ends of limbs with a name like "foot", or
-    at least two ends of limbs near the lowest height of the default posture.
+    The function tries three choices: the frames ``named`` by the SRDF, then ends of limbs with a name like "foot",
+    then at least two ends of limbs near the lowest height of the default posture.
     """
     known = tuple(name for name in named if name in robot.frame_names)
     if known:

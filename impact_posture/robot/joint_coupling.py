@@ -52,7 +52,7 @@ def composed(stated: Mapping[str, JointCoupling], where: str) -> tuple[JointCoup
 
 
 def urdf_couplings(root: ET.Element, where: str) -> tuple[tuple[JointCoupling, ...], list[str]]:
-    """Return the couplings that the ``<mimic>`` tags of a URDF state, and warnings about tags that state none.
+    """Return the couplings that ``<mimic>`` tags of a URDF state, and warnings about tags that state no coupling.
 
     The function changes the tags of coupled joints in ``root``.  Continuous joints become revolute joints without
     limits, because a cosine and a sine do not count the full turns of a leader.  The limits of a joint become equal

@@ -28,7 +28,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class Transmissions:
-    """Transmission of each velocity entry, shape (nv,); a floating base has none.
+    """Transmission of each velocity entry, shape (nv,); a floating base has no transmission.
 
     The rotor of a ``rigid`` joint moves with the link.  A ``locked`` joint cannot be driven from its link.
     ``stiffness`` between rotor and link is in N·m/rad (N/m if prismatic).  It is infinite if robot.toml does not

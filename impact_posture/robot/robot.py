@@ -172,7 +172,7 @@ class Robot:
 
     @property
     def first_joint(self) -> int:
-        """Index of the first joint in ν: 6 with a floating base, else 0."""
+        """Index of the first joint in ν: 6 with a floating base, otherwise 0."""
         return 6 if self.floating else 0
 
     @cached_property

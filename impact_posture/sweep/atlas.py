@@ -29,7 +29,7 @@ _DATA = "data"
 # Folder for results of the first pass.  Neighboring shards start from these results even after the second pass has
 # replaced the file in _DATA.
 _FIRST_PASS = "first-pass"
-# Number of shards whose postures stay in memory, because successive shards have common neighbors.
+# Number of shards whose postures stay in memory, because consecutive shards have common neighbors.
 _KEPT = 16
 # Subpackages of impact_posture whose code affects the results.
 _PACKAGES = ("robot", "dynamics", "collision", "impact", "posture", "sweep")

@@ -20,7 +20,7 @@ class Actuators:
 
     Attributes:
         rotors: Number of rotors.
-        base: 6 for a floating base, else 0.
+        base: Number of velocity entries of the base: 6 for a floating base, otherwise 0.
         G: Actuation matrix, shape (nv, controls).
         inverse: Pseudo-inverse ``G_b⁺``, shape (rotors, base).
         blind: Orthonormal basis of the base wrenches that rotors cannot produce, shape (base, base − rank).

@@ -18,7 +18,7 @@ _OFF = 1e-6
 # A row that violates a bound by more than this keeps its value while the cost is minimized.  The violation is
 # relative to the norm of the row times the norm of z.
 _MISSES = 1e-9
-# Largest violation of a bound by a result, relative as for ``_MISSES``.
+# Largest violation of a bound by a result, relative to the same product as ``_MISSES``.
 _ROUNDING = 1e-13
 # ``_FAR`` is a bound that DAQP treats as infinite.  ``_SETTINGS`` are the DAQP settings of :func:`_cheapest`.
 _FAR, _SETTINGS = 1e30, SETTINGS | {"primal_tol": 1e-11}

@@ -71,7 +71,7 @@ class InvariantDriver(ImpactFeedbackDriver):
     """Feedback on the impact-invariant subspace around an impact (Yang and Posa 2021).
 
     An impulse at the contact changes ν only in the range of ``M⁻¹Jᵀ``.  Around the impact, the velocity feedback of
-    every task uses ``ν + α M⁻¹Jᵀ λ*`` instead of ν, so that the feedback does not oppose velocities that an impulse
+    every task uses ``ν + α M⁻¹Jᵀ λ*`` instead of ν.  The feedback then does not oppose velocities that an impulse
     can cause.  ``λ*`` minimizes ``‖ẏ_des − J_y (ν + M⁻¹Jᵀ λ)‖``.  If the time ``t`` is within ``T`` = ``WINDOW`` (s)
     of the impact at ``t*``, then ``α = 1 − exp(−(T − |t − t*|)/τ)`` with ``τ`` = ``FADE`` (s); otherwise, α is 0.
 
@@ -137,10 +137,11 @@ class ReferenceSpreadingDriver(ImpactFeedbackDriver):
     # The target speed before the impact is computed with at least this distance, m.  With zero, the robot would never
     # start.
     BEGIN = 2e-3
-    # Distance of the target along the approach at the touch, which increases in the interim mode, m; duration of the
-    # contact, s; time at which the interim mode ended, s, or ``None``.
+    # Distance of the target along the approach at the touch, m.  It increases in the interim mode.
     _touch: float
+    # Duration of the contact, s.
     _lasted: float
+    # Time at which the interim mode ended, s; ``None`` before this time.
     _done: float | None
 
     def __init__(self, setup: Setup, posture: JointPosture) -> None:
@@ -204,7 +205,7 @@ class ImpactAwareDriver(Driver):
     scenario, the commands are the same as from the nominal controller.
 
     There are two differences from the paper.  First, limits that the present state violates are relaxed, like joint
-    limits; the paper does not treat this case.  Second, the forces at the feet during the impact are not limited; in
+    limits; the paper does not treat this case.  Second, the forces at the feet during the impact are not limited.  In
     the paper, standing feet also satisfy zero-moment point and friction constraints during the impact.
     """
 

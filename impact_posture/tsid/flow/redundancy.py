@@ -27,9 +27,8 @@ class Redundancy:
         basis: Orthonormal basis ``Z`` of the free directions, shape (nv, r).
         inverse: Pseudo-inverse ``J⁺`` on the constrained directions, shape (nv, rows).
         springs: ``k JZ`` of nearly dependent constraints, which are springs of stiffness ``k``, shape (rows, r);
-            ``None`` if there are none.
-        stiffness: Stiffness ``k s²`` of the springs along each column of ``Z``, shape (r,); ``None`` if there are
-            none.
+            ``None`` without springs.
+        stiffness: Stiffness ``k s²`` of the springs along each column of ``Z``, shape (r,); ``None`` without springs.
     """
 
     basis: Array

@@ -13,9 +13,10 @@ from impact_posture.tsid.qp.quadratic_program import QP, Solved
 SOLVED, _NONE = (1, 2), -1
 # Exit flag of this class for a failure of the solver, which says nothing about feasibility.
 _FAILED = 0
-# primal_tol is the largest violation of a bound.  iter_limit is the largest number of iterations.  sing_tol is the
-# squared sine of the smallest angle between a row and the active rows.  For a quadruped, the cost has the condition
-# number 4e10 and makes rows nearly parallel.  The DAQP default of 3.7e-11 would treat these rows as dependent.
+# Settings of DAQP.  ``primal_tol`` is the largest violation of a bound.  ``iter_limit`` is the largest number of
+# iterations.  ``sing_tol`` is the squared sine of the smallest angle between a row and the active rows.  For a
+# quadruped, the cost has the condition number 4e10 and makes rows nearly parallel.  The default ``sing_tol`` of DAQP,
+# 3.7e-11, would treat these rows as dependent.
 SETTINGS = {"primal_tol": 1e-9, "iter_limit": 1000, "sing_tol": 1e-13}
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from impact_posture.system.arrays import Array
 from impact_posture.tsid.qp.quadratic_program import EQUALITY, INEQUALITY
 
-# Bounds are scaled so that none exceeds this value, because the tolerances of DAQP are absolute.
+# Bounds are scaled so that no bound exceeds this value, because the tolerances of DAQP are absolute.
 _LARGEST = 1e4
 # Tolerances within which a row is at its bound, relative to the norm of the row times the norm of z.  The refinement
 # uses the first tolerance with which the refined solution is not worse than the solution of DAQP.
@@ -154,7 +154,7 @@ def _nearest(levels: Sequence[Level]) -> Array | None:
 def balanced(A: Array, b: Array) -> tuple[Array, Array]:
     """Return ``QA`` (k, n) and ``Qb`` (k,), where ``Q`` is orthogonal and all rows of ``QA`` have equal length.
 
-    Each rotation combines the shortest and the longest row, so that the shortest row gets the root-mean-square length
+    Each rotation combines the shortest and the longest row.  The shortest row then has the root-mean-square length
     (Bendel and Mickey 1978, "Population correlation matrices for sampling experiments").
     """
     A, b = A.copy(), b.copy()
