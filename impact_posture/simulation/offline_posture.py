@@ -45,7 +45,7 @@ class OfflinePosture:
         objective: Objective at the optimal posture.
         initial: Objective at the start posture after its projection onto the constraints.
         distance: Distance of the optimal posture from the projected start posture, rad (m).
-        note: Requirement that the posture does not satisfy, and the reason; empty if it satisfies all requirements.
+        note: Requirements that the posture does not satisfy, and the reasons; empty if it satisfies all requirements.
     """
 
     solution: PostureSolution
@@ -84,17 +84,16 @@ def offline_posture(
     - The base of a flying robot stays level.
     - The feet of a standing robot stay in place.  The center of mass is above the feet, and the base tilts at most as
       far as the reference flow allows.
-
     - With ``keep_feet``, no foot of a standing robot lifts or slides during the impact.
 
     If the search does not reach a posture with all constraints, it drops ``keep_feet``, and then also the constraints
-    on collisions.  The ``note`` of the result states the last dropped constraint.
+    on collisions.  The ``note`` of the result states the dropped constraints.
 
     Raises:
         Infeasible, SolverFailed: The same errors as in :func:`impact_posture.posture.search.multistart.solve`.
     """
     tell("looking for the offline posture")
-    wanted, note = scenario_requirements(setup, objective, at_contact=at_contact), ""
+    wanted, notes = scenario_requirements(setup, objective, at_contact=at_contact), dict[tuple[bool, bool], str]()
     # A robot that does not stand has no support polygon, so the second margin is zero.
     margins = dict.fromkeys((stops, edges if wanted.com_over_feet else 0.0) for stops, edges in _MARGINS)
     kept = keep_feet and bool(objective.supports)
@@ -110,15 +109,15 @@ def offline_posture(
             if (keep, collision, stops, edges) == attempts[-1]:
                 raise
             if keep:
-                note = (
-                    f"feet may lift or slide at the impact, because no posture in which they stay is known: {error}"
-                )
-            elif collision:
-                note = f"links may touch in the offline posture, because none without collisions is known: {error}"
+                what = "feet may lift or slide at the impact, because no posture in which they stay is known"
+            else:
+                what = "links may touch in the offline posture, because none without collisions is known"
+            notes[keep, collision] = f"{what}: {error}"
             continue
         value, initial = objective.value(solution.q), objective.value(solution.initial)
         moved = distance(Chart(setup.robot.model), solution.q, solution.initial)
-        return OfflinePosture(solution, value, initial, moved, note if (keep, collision) != attempts[0][:2] else "")
+        notes.pop((keep, collision), None)
+        return OfflinePosture(solution, value, initial, moved, "; ".join(notes.values()))
     raise AssertionError("the last attempt returns or raises")
 
 

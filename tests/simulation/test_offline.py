@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pinocchio as pin
 import pytest
 
 from docs.studies.robustness.outcomes import is_held
+from impact_posture.errors import Infeasible
+from impact_posture.posture.constraints.requirements import Requirements
 from impact_posture.posture.formulation.build_problem import build_problem
 from impact_posture.posture.loads.load_cases import load_cases
 from impact_posture.posture.search.growing_search import feasible
@@ -77,6 +81,31 @@ def test_a_note_reports_possible_collisions(monkeypatch: pytest.MonkeyPatch) -> 
     posture = offline_posture(setup, objective, starts=1)
     assert posture.note.startswith("links may touch in the offline posture, because none without collisions is known")
     assert "\n" not in posture.note and posture.objective < posture.initial
+
+
+@pytest.mark.parametrize(
+    ("works", "words"),
+    [
+        (lambda r: not r.keep_contacts and not r.limit_margin, ["feet may lift"]),
+        (lambda r: not r.collision, ["feet may lift", "links may touch"]),
+        (lambda r: not r.limit_margin, []),
+    ],
+)
+def test_a_note_names_all_dropped_requirements(
+    works: Callable[[Requirements], bool], words: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    setup = set_up(read_scenario("solo8-push"))
+    monkeypatch.setattr(offline, "build_problem", lambda *arguments: arguments[-1])
+
+    def solve(requirements: Requirements, **_: object) -> SimpleNamespace:
+        if works(requirements):
+            return SimpleNamespace(q=setup.q, initial=setup.q)
+        raise Infeasible({"all": 1.0})
+
+    monkeypatch.setattr(offline, "solve", solve)
+    note = offline_posture(setup, scenario_objective(setup), keep_feet=True).note
+    assert [word for word in ("feet may lift", "links may touch") if word in note] == words
+    assert bool(note) == bool(words)
 
 
 def test_free_objectives_have_no_requirements_on_the_feet() -> None:
