@@ -137,7 +137,7 @@ def added_files(folder: Path, *, force: bool) -> Iterator[Path]:
 
 def _unwritable(out: Path, error: OSError, hint: str) -> OutputError:
     """Return the error for a folder that cannot be written.  The error names the cause if this is another file."""
-    cause = Path(os.fsdecode(error.filename)) if isinstance(error.filename, str | bytes) else out
+    cause = Path(os.fsdecode(error.filename) if isinstance(error.filename, str | bytes) else out).absolute()
     whole = out.absolute()
     inside = whole in (cause, *cause.parents) or cause == whole.parent
     if inside or any(part.startswith(SCRATCH) for part in cause.parts):

@@ -382,6 +382,17 @@ def test_a_file_elsewhere_that_fails_is_named(writing: str, tmp_path: Path) -> N
     assert os.listdir(tmp_path) == []
 
 
+@pytest.mark.parametrize("name", [None, "out", "out/result.json", "."])
+def test_a_relative_folder_is_not_a_file_elsewhere(
+    name: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    arguments = (13, "Permission denied") if name is None else (13, "Permission denied", name)
+    with pytest.raises(OutputError) as caught, whole_folder(Path("out"), force=False, kind="result"):
+        raise OSError(*arguments)
+    assert "because of" not in str(caught.value) and "choose another" in str(caught.value)
+
+
 def test_a_folder_of_a_killed_command_in_a_result_is_not_foreign(tmp_path: Path) -> None:
     write(tmp_path / "out", "one")
     killed = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path / "out")], check=False, timeout=60)
