@@ -20,10 +20,10 @@ _LEAST_COMPLIANCE = 1e-6
 def default_compliance(robot: Robot) -> float:
     """Return the default support compliance ε, 1/kg, for which a foot acts as if it had the mass of 10⁴ robots.
 
-    The solution of ``M a − J_sᵀ f = Jᵀ n, J_s a + ε f = 0`` is smooth in ``q`` for any ε > 0.  Compared with rigid
-    feet, the effect of the feet on the velocity jump is reduced by at most the fraction ``ε/(σ + ε)``, where σ is the
-    least eigenvalue of ``J_sM⁻¹J_sᵀ`` above zero.  The fraction is 1e-4 if the effective mass at the feet is the mass
-    of the robot, and larger if ``J_s`` nearly loses rank.
+    The solution of ``M a − J_sᵀ f = Jᵀ n, J_s a + ε f = 0`` is smooth in ``q`` for any ε > 0.  Compliance reduces the
+    effect of the feet on the velocity jump by at most the fraction ``ε/(σ + ε)``.  Here, σ is the least eigenvalue of
+    ``J_sM⁻¹J_sᵀ`` above zero.  The fraction is 1e-4 if the effective mass at the feet is the mass of the robot, and
+    larger if ``J_s`` nearly loses rank.
     """
     return _DEFAULT_COMPLIANCE / robot.mass
 

@@ -36,7 +36,7 @@ FACTORS = (0.8, 1.0, 1.2)
 _EDGE = 4
 # Number of postures of a stop at which its distances are measured.
 _POSTURES = 12
-# Feet are on level ground if their corners differ in height by less than this, m.
+# Feet are on level ground if the heights of their corners differ by less than this value, m.
 _LEVEL = 1e-3
 
 

@@ -30,7 +30,7 @@ SPEED = 0.5  # approach speed, m/s
 # the links alone, is between 0.05 and 2.
 STIFFNESSES = 10
 LEAST, LARGEST = 0.05, 2.0
-# Normals are left out if the joints move the contact point along the normal by less than this, m/rad.
+# A normal is left out if the joints move the contact point along it by less than this value, m/rad.
 _REACH = 0.15
 EDGES = (0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 2.0)
 MODELS = ("elastic", "link", "reflected")

@@ -217,10 +217,10 @@ def _times(values: Iterable[Any]) -> Vector:
 def contact_row(effort: Vector, command: Vector) -> int | None:
     """Return the first row in which the contact shows; ``None`` if no row does.
 
-    Some 45 to 60 ms after the contact, the controller brakes, and its torque on joint 1 falls at once.  In the 70 ms
-    before the braking, the contact is the first row in which the effort of a joint changes by 4 N·m, and by 5 N·m
-    within two rows.  Joint 2 does not count, because its large effort is noisy.  In the 24 windows with braking, the
-    row differs by at most one from the row that their authors state.
+    Some 45 to 60 ms after the contact, the controller brakes, and its torque on joint 1 falls at once.  The contact
+    is searched in the 70 ms before the braking.  It is the first row in which the effort of a joint changes by 4 N·m,
+    and by 5 N·m within two rows.  Joint 2 does not count, because its large effort is noisy.  In the 24 windows with
+    braking, the row differs by at most one from the row that their authors state.
     """
     if len(effort) < _BRAKED:
         return None

@@ -31,8 +31,7 @@ from impact_posture.simulation.offline_posture import SHARE
 Records = Mapping[str, Sequence[Record]]
 # The documentation includes the text before this mark in one place, and the text after this mark in another place.
 MARK = "<!-- tables -->"
-# A shoulder is treated as under the center of the base if its horizontal distance from the center is less than this,
-# m.
+# A shoulder at most this horizontal distance from the center of the base is treated as under the center, m.
 _UNDER = 0.04
 # Drawn values for which the page shows rank correlations.
 _RANKED = ("x", "z", "speed", "force", "stiffness", "armature", "gain", "contact", "friction")

@@ -28,7 +28,7 @@ FRICTIONS = (0.0, 0.3, 1.0)
 STIFFNESSES = (1e5, 1e6)
 # In a simulation, a foot or a contact point moves if its speed is above this share of the approach speed.
 MOVES = 0.01
-# The prediction names the right joint if no other joint uses a share of its limit that is larger by more than this.
+# The prediction names the right joint if the simulated share of no other joint is larger by more than this fraction.
 _SAME_JOINT = 0.05
 # Accuracy of the simulated contact time from which on the feet stay.
 _HOLDING = 0.05

@@ -28,8 +28,8 @@ class StandingImpact(JsonBlock):
         slides: Frames of the feet that slide without lifting.
         time: Time over which the feet carry the weight in this prediction, s: the compression time of the contact, or
             zero if this time or the weight on the feet is unknown.
-        holding_time: Shortest contact time at which the weight keeps all feet in place, s; ``None`` if the user gave
-            the contact time, if no foot moves, or if this time is above 0.1 s.
+        holding_time: Shortest contact time at which the weight keeps all feet in place, s.  ``None`` if the user gave
+            the contact time, if no foot moves, or if the shortest time is above 0.1 s.
     """
 
     jump: Jump

@@ -202,7 +202,7 @@ def _title(data: TradeOffData) -> str:
 
 # Number of joints with a color and a name: the joints that move most.  Other joints are gray.
 _NAMED = 8
-# Joints that move less than this, rad or m, are not drawn.
+# Joints that move less than this value, rad or m, are not drawn.
 _MOVES = 1e-4
 _SHARES: dict[str, dict[str, Any]] = {
     "velocity": {"color": BLUE, "linestyle": "-"},

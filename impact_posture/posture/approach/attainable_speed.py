@@ -108,8 +108,8 @@ class AttainableSpeed:
     ``contact_pose`` is ``free`` is left out, because there an object hits the robot.
 
     For a strike (:attr:`Requirements.strike`), the joints also need room for a run-up: ``q_i − ν_i t`` is within the
-    joint limits, where ``t`` is a bit longer than half of the shortest run-up.  A small share of the velocity limits
-    is left to the run-up.
+    joint limits.  ``t`` is slightly longer than half of the shortest run-up.  A small share of the velocity limits is
+    left to the run-up.
 
     Attributes:
         unknown: Reason why the speed is not computed; empty if it is computed.  A computed speed can still be

@@ -123,7 +123,7 @@ class Clearance(Constraint):
             pair, old = self._pairs[k], active.get(k, Corners(frozenset(), frozenset()))
             if k in unknowns and pair.slack(unknowns[k]) > -values[k] / 2:
                 continue
-            # If the closest corners already have rows, all corners are added: the plane of the program may differ
+            # If the closest corners already have rows, all corners are added.  The plane of the program may differ
             # from the plane between the closest points, and may then cut any corner without a row.
             for new in (pair.corners(model), pair.every_corner):
                 if not (new.a <= old.a and new.b <= old.b):

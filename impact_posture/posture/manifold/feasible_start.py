@@ -19,8 +19,8 @@ FEASIBLE = 1e-8
 # Maximum number of random postures that are projected onto the constraints for one start.
 ATTEMPTS = 20
 _STEPS = 80
-# If the violation decreases by less than a fifth in this many steps, the projection stops, because it would probably
-# not converge.
+# Number of steps in which the violation must decrease by at least a fifth.  Otherwise the projection stops, because
+# it would probably not converge.
 _PATIENCE = 16
 # Maximum number of projected postures among which one start is chosen.
 CANDIDATES = 3

@@ -21,7 +21,8 @@ from impact_posture.system.arrays import Array
 _SAFETY = 2.0
 # A posture is treated as feasible if its distance from the feasible set is at most this value.
 _FEASIBLE = 1e-7
-# A patch is discarded if the first-order distance of its center from the feasible set exceeds this many radii.
+# A patch is discarded if its center is farther from the feasible set, to first order, than this multiple of its
+# radius.
 _BEYOND = 1.5
 _MOST = 200_000
 # A disc is covered by seven discs of half the radius, one of them in the middle.  A segment is covered by two

@@ -40,7 +40,7 @@ _LEAST = 2
 # A start is dominated, and stops, if its objective exceeds the best objective by this share.  The share is large
 # because a run after a trap may end below the bound of its start.
 _FAR = 0.05
-# Starting processes takes as long as runs with this many unknowns in total.
+# Starting processes takes as long as runs with this number of unknowns in total.
 _FORK = 200
 # Starts that continue from postures this close (rad, m) share one run, because their runs would end at the same
 # posture.

@@ -39,7 +39,7 @@ _DIGITS = 9
 # If the relative reduction of the objective is below this value, the result is not reported as better.  The jump is
 # the square root of the objective, so the jump then changes by less than 0.05 %.
 _NO_GAIN = 1e-3
-# If only one of at least this many starts ended at the best optimum, the solution gets a note.
+# With at least this number of starts, a note is added if at most one of them ended at the best optimum.
 _MANY = 8
 
 

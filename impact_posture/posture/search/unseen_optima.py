@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from impact_posture.config.json_block import JsonBlock
 
-# Rule of three: if N starts reached each optimum at least twice, at most the share ``_RULE_OF_THREE / N`` of further
+# Rule of three.  If N starts reached each optimum at least twice, at most the share ``_RULE_OF_THREE / N`` of further
 # starts leads to a new optimum, with a confidence of 95 %.
 _RULE_OF_THREE = 3
 # Two objectives count as one up to this relative difference.
