@@ -9,8 +9,8 @@ and the normal force reach their maxima; the largest force is F:
 - contact of known T: treated as the linear contact with this T, ``F = (π/2) mv/T``.
 
 The mass is ``m = nᵀp/v`` with the impulse p of the plastic impact at the friction of the contact
-(:mod:`impact_posture.impact.friction.coulomb_impact`).  This is exact: while the normal force grows, the point sticks
-or slides along one constant direction, so the friction force is proportional to the normal force.
+(:mod:`impact_posture.impact.friction.coulomb_impact`).  This mass is exact.  While the normal force grows, the point
+sticks or slides along one constant direction, so the friction force is proportional to the normal force.
 
 The ratio ``x = T/√(m C)`` determines whether the rotors behind elastic transmissions respond to the impact.  It
 compares T with the response time of the joint springs.  Here ``m`` is the mass for the links alone, and ``C =

@@ -95,8 +95,8 @@ class Surroundings:
         of the contact link and the links fixed to it.  The contact link and the links fixed to it may touch the
         surface.  Other links may touch the surface if their own contacts lie in the plane, for example a foot next to
         the struck foot.  This also applies to contacts at the same surface, for example the other hand at a wall.  If
-        a foot or a fixed base lies behind the plane, the surface must end before this body, so a patch is used
-        instead of the plane.
+        a foot or a fixed base lies behind the plane, a patch is used instead, because the surface must end before
+        this body.
 
         ``width`` is the edge length of the patch, m; infinite for the plane.  If ``width`` is ``None``, the plane is
         used unless a fixed body lies behind the plane.  ``feet`` are the contact points of the feet.  ``contacts``

@@ -48,7 +48,7 @@ def fix_undetermined_motions(
 
     Some motions of the whole robot, such as translations, do not change the objective.  If the constraints allow a
     motion that does not change the objective, this motion of the base is fixed.  If the contact pose is free and the
-    robot has no feet, yaw is fixed as well, because a turn of the whole robot leaves its joint positions unchanged.
+    robot has no feet, yaw is fixed as well, because a turn of the whole robot does not change the joint positions.
     """
     if not robot.floating:
         return [], []

@@ -1,7 +1,7 @@
 """Evaluate a CasADi function at many postures at once.
 
 CasADi evaluates one posture after another.  For a batch, NumPy runs each operation of the function on all postures
-together, which takes about a sixth of the time for a batch of 512.
+together.  For 512 postures, this takes about a sixth of the time.
 """
 
 from __future__ import annotations

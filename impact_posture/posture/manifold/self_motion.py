@@ -39,9 +39,9 @@ _STEP = 0.16
 _APART = 0.7
 # Number of directions in which steps from a node of a surface are tried.
 _DIRECTIONS = 8
-# Radius that a node of a surface covers, as a share of the step, is the sum of two distances.  First, a point one
-# step away from a node lies near a tried point, because its direction differs from a tried direction by at most half
-# the angle between these.  Second, each tried point lies within ``_APART`` of a node.
+# Radius that a node of a surface covers, as a share of the step.  The direction to any point one step away differs
+# from a tried direction by at most half the angle between tried directions.  This bounds the distance from the point
+# to a tried point.  Each tried point lies within ``_APART`` of a node, and the radius is the sum of both distances.
 COVERED = _APART + 2 * np.sin(np.pi / _DIRECTIONS / 2)
 _BATCH = 100
 

@@ -66,9 +66,9 @@ class SolverRun:
         certificate: Certificate of the final posture; ``None`` while the program lacks parts.
         lacks: Whether the program lacks parts that the final posture needs.
         dominated: Whether the start was stopped after this run because it could not become the best.
-        trapped: Whether the final posture violates a constraint that more parts cannot repair: no parts are missing,
-            or slack lowers the objective by more than its price.  A trapped run is repeated at a higher price of
-            slack.
+        trapped: Whether the final posture violates a constraint that more parts cannot repair.  Either no parts are
+            missing, or slack lowers the objective by more than its price.  A trapped run is repeated at a higher
+            price of slack.
         time_s: Wall time of all runs from the start, s; the time of a run for several starts is divided equally among
             them.
     """
