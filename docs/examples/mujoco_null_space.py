@@ -21,8 +21,8 @@ import impact_posture as ip
 
 MJCF = Path(__file__).parent / "rail_arm_mjcf" / "rail_arm.xml"
 NORMAL = (0.0, 0.0, 1.0)
-DURATION = 3.0  # s
-STIFFNESS, DAMPING = 400.0, 40.0  # of the tool, 1/s² and 1/s
+DURATION = 3.0  # duration of the simulation, s
+STIFFNESS, DAMPING = 400.0, 40.0  # stiffness and damping of the tool controller, 1/s² and 1/s
 D, SPEED = 10.0, 2.0  # damping in the null space, 1/s; norm of K/D M⁻¹∇H at the start, which gives K
 
 

@@ -41,7 +41,7 @@ def front(robot: Robot, frame: str, axis: str) -> ContactFront:
 
 
 def lines(request: Request) -> Iterator[str]:
-    """Yield a row for each robot: the foremost point of its tool beside the offset in its robot.toml."""
+    """Yield a row for each robot, with the foremost point of the tool and the offset in robot.toml."""
     head = ("robot", "contact frame", "tool along", "foremost point, m", "offset in robot.toml, m", "beyond it, mm")
     yield from table(head, (row for name in known_robots() if request.only in name for row in _rows(name)))
 

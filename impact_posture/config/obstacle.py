@@ -33,7 +33,7 @@ class Obstacle(StrictTable):
         quaternion: Orientation of a box in the world, x y z w.
 
     Raises:
-        InputError: A value is not valid, or not exactly one of ``box`` and ``sphere`` is given.
+        InputError: A value is not valid, or ``box`` and ``sphere`` are both given or both missing.
     """
 
     name: _Name

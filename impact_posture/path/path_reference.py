@@ -50,7 +50,7 @@ class PathReference:
             the path; zeros if the contact is not known, and the second event then never occurs.
         late: Longest time for which the references continue after the expected contact, s.
         felt: Force above which a contact is felt, N.
-        stopped: Share of the planned speed below which the contact point has been stopped.
+        stopped: The contact is noticed if the contact point has less than this share of its planned speed.
         lag: Time by which the accelerations are ahead of postures and velocities, s, because the thrust of rotors
             lags behind its command.
         phase: Phase at the last tick.

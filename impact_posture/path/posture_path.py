@@ -187,7 +187,7 @@ def _struck(
     seed: int,
     effort: int,
 ) -> PosturePath | str:
-    """Return the path that strikes the first optimum with the stated or else the greatest speed; or why none does."""
+    """Return a path that strikes an optimum with the stated speed, or else the greatest speed; or why none does."""
     # The program requires the greatest possible speed if no posture allows the stated speed.
     constraints = solution.problem.constraints if solution.problem.requirements.strike else ()
     required = min([speed, *(c.speed for c in constraints if isinstance(c, ApproachSpeed))])

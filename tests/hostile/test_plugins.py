@@ -1,4 +1,4 @@
-"""Controllers of other packages that raise, end the process or return rubbish give an error that names them.
+"""If a controller of another package raises, ends the process or returns rubbish, the error names the controller.
 
 ``--hostile-full`` tries all controllers.
 """

@@ -67,7 +67,7 @@ def statics(posed: ConstrainedProblem, case: LoadCase, q: Vector, z: Vector) -> 
         elif own.size:
             support = next(s for s in posed.objective.supports if s.frame == source.names[0])
             index = model.getFrameId(support.frame)
-            # Point of the force source on its link, in the frame of the foot.
+            # Point where the force acts, in the frame of the foot.
             offset = model.frames[index].placement.actInv(source.point.position)
             assert np.abs(offset - support.offset)[:2] == pytest.approx(support.size if support.has_sole else (0, 0))
             tau -= frame_jacobian(model, q, index, offset)[:3].T @ (source.columns @ own)[:3]

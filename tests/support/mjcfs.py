@@ -55,7 +55,8 @@ _LEG = """
         </body>
       </body>"""
 
-# A floating base with four legs, whose hips have two joints in one body; a keyframe; degrees.
+# A floating base with four legs, whose hips have two joints in one body.  The file has a keyframe, and angles in
+# degrees.
 QUADRUPED = f"""
 <mujoco model="quadruped">
   <default><joint armature=".01" damping=".2"/><motor ctrlrange="-20 20"/></default>
@@ -77,8 +78,8 @@ QUADRUPED = f"""
 </mujoco>
 """
 
-# Two trees on the world; balls; unlimited hinges along negative and tilted axes with a reference; unnamed bodies;
-# several joints at different points of one body; a body without joints.
+# Two trees on the world, with ball joints, and with unlimited hinges along negative and tilted axes with a reference.
+# Some bodies have no name, several joints at different points, or no joint.
 ODD = """
 <mujoco>
   <compiler angle="radian"/>

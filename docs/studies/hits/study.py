@@ -80,7 +80,7 @@ class Evaluation:
         return {group: fit_contact(model, arm, measured) for group, measured in self.measured.items()}
 
     def jumps(self, group: Group) -> dict[str, Vector]:
-        """Return the predicted joint jumps of a group, rad/s, by prediction."""
+        """Return the joint jumps of a group, rad/s: name of a prediction → predicted jumps."""
         measured = self.measured[group]
         rate = _speed(measured) / _speed(self.fit.measured)
         jumps = {LINKS: Fitted(Model("link"), Arm(), 1.0).jump(measured), REPEAT: rate * self.fit.measured.jump}

@@ -1,4 +1,4 @@
-"""The page of the study of verdicts: the numbers beyond their bar, then counts for each bar, then other robots."""
+"""The page of the study of verdicts: numbers whose error is too large, counts for each number, and other robots."""
 
 from __future__ import annotations
 

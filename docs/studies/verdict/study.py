@@ -90,7 +90,8 @@ class Numbers:
         impulse: Normal impulse, N·s.
         force: Largest normal force, N.
         slips: Whether the contact point slides.
-        feet: Frame of each foot → its speed, m/s; predicted at the end, simulated the largest during the contact.
+        feet: Frame of each foot → speed of the foot, m/s.  In a prediction, it is the speed at the end; in a
+            simulation, the largest speed during the contact.
         moving: Frames of the feet that lift or slide.
     """
 

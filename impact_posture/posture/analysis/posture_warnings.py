@@ -113,7 +113,8 @@ def _ground_warnings(prepared: Prepared, q: Array, posture: str) -> list[str]:
 def _origins(prepared: Prepared, numeric: Numeric) -> list[tuple[int, str, Array]]:
     """Return joint index, name and world origin of the links or joints that no collision constraint keeps apart.
 
-    These are the links without shapes, or all joints if no link has a shape or there are no collision constraints.
+    These are the links without shapes.  If no link has a shape, or if there are no collision constraints, these are
+    all joints.
     """
     robot, around = prepared.impact.robot, prepared.problem.surroundings
     if around is not None and around.shapes.bodies:

@@ -30,8 +30,9 @@ class Distribution:
         shares: Signed share of each actuator (:class:`Equilibrium`), shape (actuators,).
         unbalanced: Sum of the absolute entries of the unbalanced wrench on the base; zero if the base is balanced.
             Forces are in units of the robot's weight, moments in units of the weight times 1 m.
-        jacobian: Tangent Jacobian of ``unbalanced`` and the absolute shares, shape (1 + actuators, nv).  With
-            unknown forces, it has nonzero rows only for the largest shares, or for ``unbalanced`` if it is not zero.
+        jacobian: Tangent Jacobian of ``unbalanced`` and the absolute shares, shape (1 + actuators, nv).  With unknown
+            forces, only the rows of the largest shares are nonzero, or the row of ``unbalanced`` if the base is not
+            balanced.
     """
 
     forces: Array

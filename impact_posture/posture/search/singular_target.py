@@ -90,7 +90,7 @@ def _bent(problem: ConstrainedProblem, gains: _Gains, rank: int) -> dict[str, fl
     """Return the fewest joint positions that bend the given posture so that no direction is nearly lost."""
     robot, bent, best = problem.robot, dict[str, float](), problem.given
     model, steps = robot.model, np.eye(robot.nv)
-    # The joints with a single velocity entry.
+    # Only joints with a single velocity entry are bent.
     turning = {*robot.joint_names} & {*robot.tangent_names} - {*problem.requirements.hold}
     while len(bent) < _MOST_BENT and gains(best)[rank - 1] < _CLEAR:
         trials = []

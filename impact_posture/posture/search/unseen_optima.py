@@ -19,7 +19,7 @@ SAME_VALUE = 5e-3
 
 @dataclass(frozen=True)
 class SearchEstimate(JsonBlock):
-    """What a search reached, and what it may have missed.  Optima with equal objectives count as one.
+    """The optima that a search reached, and an estimate of the others.  Optima with equal objectives count as one.
 
     Attributes:
         method: ``adaptive`` or ``multistart``.
