@@ -158,7 +158,7 @@ def _head(path: Path) -> bytes:
 
 
 def _root_transform(path: Path) -> Array | None:
-    """Return the transform of the single root node of a glTF file, which coal leaves out, shape (4, 4).
+    """Return the transform that coal leaves out: of the single root node of a glTF file, shape (4, 4).
 
     Return ``None`` for other files, and for a root node that coal reads correctly.
     """

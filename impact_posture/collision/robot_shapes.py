@@ -85,7 +85,7 @@ class _Source:
     links: tuple[str, ...]
 
     def without_shapes(self, used: Collection[str]) -> tuple[str, ...]:
-        """Return :attr:`RobotShapes.without_shapes` for the case that the shapes of the links ``used`` are used."""
+        """Return :attr:`RobotShapes.without_shapes`; ``used`` are the links whose shapes are used."""
         model, bare = self.robot.model, list[str]()
         frames = [frame for frame in model.frames if frame.type == pin.FrameType.BODY]
         covered = {0, *(int(frame.parentJoint) for frame in frames if frame.name in used)}

@@ -52,7 +52,7 @@ def hull_surface(points: Array) -> tuple[Array, Triangles]:
 
 
 def triangle_mesh(points: Array, triangles: Triangles) -> Any:
-    """Return the coal mesh with these corners, shape (k, 3), m, and triangles, shape (n, 3)."""
+    """Return the coal mesh with the corners ``points``, shape (k, 3), m, and ``triangles``, shape (n, 3)."""
     mesh = coal.BVHModelOBBRSS()
     mesh.beginModel(len(triangles), len(points))
     mesh.addVertices(points)

@@ -10,9 +10,9 @@ are::
     ∂φ/∂q_j       = U_j(b)ᵀF_j(a) + U_j(a)ᵀF_j(b)
     ∂²φ/∂q_j∂q_k  = U_j(b)ᵀA_k(a) + U_j(a)ᵀA_k(b),   A_k = S_k ×* F_k + I_k U_k,   for k in the subtree of j
 
-``I_k`` is the inertia of the subtree of k.  ``F_k(a)`` is the momentum of this subtree for the velocity a, minus the
-impulses ``f`` on its feet.  ``F_k(b)`` is the momentum of the subtree for the velocity b, plus ``l``.  Automatic
-differentiation needs about twice as many operations for standing robots.
+``I_k`` is the inertia of the subtree of k.  ``F_k(a)`` is the momentum of this subtree for the velocity ``a``, minus
+the impulses ``f`` on its feet.  ``F_k(b)`` is the momentum of the subtree for the velocity ``b``, plus ``l``.
+Automatic differentiation needs about twice as many operations for standing robots.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ class JumpDerivatives:
         return below + above.T
 
     def _at_feet(self, motions: ca.SX, joints: Sequence[int]) -> ca.SX:
-        """Return foot velocities, one column per joint; links after ``joints[k]`` move with ``motions[:, k]``."""
+        """Return foot velocities.  In column k, the links after ``joints[k]`` move with ``motions[:, k]``."""
         rows = [ca.SX(0, len(joints))]
         for foot, X in zip(self._feet, self._foot_motions, strict=True):
             rows.append(_kept(X @ motions, np.tile(self._lies_on([foot.point.joint], joints), (foot.rows, 1))))

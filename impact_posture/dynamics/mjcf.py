@@ -177,7 +177,7 @@ def _is_free(model: pin.Model, slot: JointSlot) -> bool:
 
 
 def _link_name(model: pin.Model, joint: int) -> str:
-    """Return the name of the link whose frame equals the joint frame, or else the name of the joint."""
+    """Return the name of the link whose frame equals the joint frame; without such a link, the name of the joint."""
     for frame in model.frames:
         if frame.parentJoint == joint and frame.type == pin.FrameType.BODY and frame.placement.isIdentity(1e-12):
             return str(frame.name)

@@ -133,7 +133,7 @@ def _links_touch(setup: Setup, runs: Iterable[Run]) -> Iterator[str]:
 
 
 def _below(setup: Setup, q: Array, n: Array, point: Array) -> Flags:
-    """Return in which postures the link with the rotors touches the plane through ``point`` with normal ``n``."""
+    """Return, for each posture, whether the link with the rotors touches the plane (``point``, normal ``n``)."""
     turned = Rotation.from_quat(q[:, 3:7]).inv().apply(n)
     depth = (turned @ setup.world.built.rotor_link.T).min(axis=1)
     return np.asarray((q[:, :3] - point) @ n + depth < 0)

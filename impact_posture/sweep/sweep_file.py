@@ -33,7 +33,7 @@ _MOST = 10**15
 # Maximum number of combinations of values that need separate programs, because the settings of all combinations are
 # in memory.
 _MOST_CASES = 10**5
-# Number of neighbors from which a point is warm started, chosen along the fastest axes.
+# A point is warm started from at most this number of neighbors, which lie along the axes that vary fastest.
 _NEIGHBORS = 2
 
 

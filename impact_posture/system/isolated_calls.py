@@ -134,7 +134,7 @@ def _received(copy: Copy[_Outcome[_Result]], seconds: float) -> _Outcome[_Result
 
 
 def _activity(pid: int | None) -> tuple[bool, int]:
-    """Return whether a process sleeps, but not for a disk, and the processor time of the process in clock ticks.
+    """Return whether a process sleeps without waiting for a disk, and its processor time in clock ticks.
 
     On systems other than Linux, the result is ``(False, 0)``.
     """
@@ -149,7 +149,7 @@ def _activity(pid: int | None) -> tuple[bool, int]:
 
 
 def _memory() -> int:
-    """Return the address space of this process, bytes; 0 on other systems than Linux, which do not limit it."""
+    """Return the address space of this process, bytes; 0 on systems other than Linux, where it is not limited."""
     try:
         return int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[0]) * resource.getpagesize()
     except OSError:

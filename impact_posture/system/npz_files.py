@@ -67,7 +67,7 @@ def fitting_arrays(
         sizes: Known sizes of dimensions.
 
     Raises:
-        ValueError: An array is missing, empty, of another shape or type, or contains impossible numbers.
+        ValueError: An array is missing, is empty, has another shape or type, or contains numbers of another kind.
     """
     import numpy as np
 

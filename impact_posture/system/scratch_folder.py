@@ -36,7 +36,7 @@ def made_by() -> dict[str, str]:
 
 @contextmanager
 def scratch_folder(parent: Path | None = None, mode: int = 0o700) -> Iterator[Path]:
-    """Yield a temporary folder, which is removed after the block and after a signal.
+    """Yield a temporary folder, which is removed after the block, also if a signal ends the process.
 
     The folder is made in ``parent``, by default in the temporary folder of the system.  With the default ``mode``,
     only the user can read the folder.

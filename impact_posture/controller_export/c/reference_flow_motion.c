@@ -57,7 +57,7 @@ static void ip_flow_back(ip_context *c, double period, double *back)
   int i, k, row;
   ip_flow_moving(f, f->error, back);
   size = fmax(ip_largest(back, 0), IP_TINY);
-  /* A deceleration of 2/5 a stops a motion with the speed sqrt(4/5 a d) within the distance d. */
+  /* The deceleration 2a/5 stops a motion with the speed sqrt(4ad/5) within the distance d. */
   pace = fmin(fmin(1.0 / IP_RETURN, sqrt(0.8 * p->flow_acceleration[0] / size)), p->flow_speed[0] / size);
   for (i = 0; i < IP_NV; ++i) {
     change[i] = pace * back[i] - f->returning[i];
@@ -116,7 +116,7 @@ static int ip_flow_change(const ip_flow *f, const ip_params *p, double period, d
 {
   enum { N = IP_NV, FAST = 0, BRAKE = 2 };
   const double a = p->flow_acceleration[0], most = a * period, time = ip_flow_stopping(f, p);
-  /* A deceleration of 2/5 a stops a motion with the speed sqrt(4/5 a d) within the step d. */
+  /* The deceleration 2a/5 stops a motion with the speed sqrt(4ad/5) within the step d. */
   const double pace = fmin(sqrt(0.8 * a / fmax(ip_largest(f->wanted, 0), IP_TINY)), IP_RATE);
   const int descends = fastest > 0.0 && f->visited == IP_PATH;
   double wanted[N], stop[N];

@@ -181,7 +181,7 @@ class FlowDirection:
         values, vectors = np.linalg.eigh(curvature)
         axes = Z @ (vectors / np.sqrt(np.maximum(np.abs(values), self._mu)))
         step = self._solve(axes, axes.T @ (Z @ slope))
-        # The step also decreases the distance term and the energy of the springs, but ``gain`` counts only ``H``.
+        # The step also decreases the distance term and the energy of the springs, but ``gain`` contains only ``H``.
         self.gain = min(self.gain * root, -float(gradient @ step))
         return step
 

@@ -46,7 +46,7 @@ class FlowGovernor:
         stay within their limits.
         """
         options, size = self._options, max(float(np.abs(remaining).max(initial=0.0)), _TINY)
-        # A deceleration of 2/5 a stops a motion with the speed sqrt(4/5 a d) within the distance d.
+        # The deceleration ``2a/5`` stops a motion with the speed ``√(4ad/5)`` within the distance ``d``.
         pace = min(1.0 / _RETURN, math.sqrt(0.8 * options.acceleration / size), options.speed / size)
         self.returning += limited(pace * remaining - self.returning, options.acceleration * period)
         return self.returning
@@ -80,7 +80,7 @@ class FlowGovernor:
         """
         options, direction, Z, flow = self._options, self._direction, space.basis, self.flow
         most = options.acceleration * period
-        # A deceleration of 2/5 a stops a motion with the speed √(4/5 a δ) within the step δ.
+        # The deceleration ``2a/5`` stops a motion with the speed ``√(4aδ/5)`` within the step ``δ``.
         pace = min(math.sqrt(0.8 * options.acceleration / max(np.abs(step).max(), _TINY)), _RATE)
         away = limited(pace * step, fastest) - flow
         # The displacement ``stop`` is twice the braking distance, because the curvature may increase during braking.
@@ -120,7 +120,7 @@ class FlowGovernor:
         return limited(after, fastest) - self.flow if np.abs(after).max(initial=0.0) > fastest else change
 
     def _braking(self, change: Array, period: float) -> float:
-        """Return the time, s, in which the new velocity covers the distance of the change and of the braking."""
+        """Return the time, s, in which the new velocity covers the distance of change and braking together."""
         return _CAUTION * self.stopping(self.flow + change) / 2 / self._able + period
 
 

@@ -104,7 +104,7 @@ class LevelRank:
         self._measure()
 
     def _measure(self) -> None:
-        """Compute the smallest singular value of all rows, a lower bound on the singular values of each level."""
+        """Compute the smallest singular value of all rows, a lower bound on the singular values of all levels."""
         self._reference[:] = self._rows
         self._independent, self._room = True, 0.0
         if np.isfinite(self._rows).all():

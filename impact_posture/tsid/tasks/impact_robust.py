@@ -38,8 +38,8 @@ def gradient_of(export: ImpactGradient, normal: ArrayLike | None = None) -> Grad
 
     Args:
         export: Export of the robot.  To ignore the robot's supports, load the export with ``free=True``.
-        normal: Unit normal for ``H`` (function ``_eval`` of the export).  With ``None``, the exported objective is
-            used, for the normal of the export (function ``_objective``).
+        normal: Unit normal for ``H`` (function ``_eval`` of the export).  With ``None``, the result is the gradient
+            of the exported objective, for the normal of the export (function ``_objective``).
 
     Raises:
         InputError: The normal is not a unit vector.
