@@ -96,7 +96,7 @@ class ControllerRow:
         ratio: Mean of the measured velocity jump divided by the jump that the rigid-body model with friction
             predicts.
         force: ``peak_force`` divided by its nominal value with the same seed; ``None`` if ``reduction`` is ``None``.
-        joint: The worst joint of any completed run.
+        joint: The joint with the largest share of its velocity limit in any completed run.
         approach: Mean of the approach speed, m/s; ``None`` for pushes.
     """
 

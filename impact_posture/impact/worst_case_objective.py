@@ -226,7 +226,7 @@ class WorstCaseObjective:
         return self.subgradients(q).first
 
     def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
-        """Return the gradients for the normals, impulses and models at most ``within`` below the maximum."""
+        """Return the gradients of all normals, impulses and models that are at most ``within`` below the maximum."""
         return self.worst_case.subgradients(q, within)
 
     def movable(self, q: Array) -> bool:

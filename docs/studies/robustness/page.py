@@ -180,8 +180,8 @@ def _splits(records: Records) -> Iterator[str]:
     for name, own in records.items():
         drawn = [r for r in tried(own) if not r.draw.name]
         for key in ("x", *words) if name == "aerial-vertical" else words:
-            # The offline optimum does not depend on K, so leave out ``posture``.  Split by the horizontal mounting
-            # only for the vertical impact; for a wall, the height of the shoulder has more effect.
+            # The offline optimum does not depend on K, so leave out ``posture``.  Only the runs of the
+            # vertical impact are split by x, the distance of the shoulder ahead of the base.
             for controller in ("robust",) if key == "gain" else ("robust", "posture"):
                 limit = middle.get(key, _UNDER)
                 so, otherwise = split(drawn, controller, lambda r, k=key, m=limit: abs(r.draw.values[k]) < m)

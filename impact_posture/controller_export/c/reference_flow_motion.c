@@ -6,7 +6,7 @@
 #define IP_STILL 1e-5
 /* Largest violation of a limit during braking, rad (m) for joints, and a share of the range for static controls. */
 #define IP_NEAR 1e-3
-/* Attempts per candidate of ip_flow_change: first unchanged, then twice without the part that crosses limits. */
+/* Attempts for each step that ip_flow_change tries: one unchanged, two without the part that crosses limits. */
 #define IP_ATTEMPTS 3
 /* The flow assumes a share of the largest acceleration for braking.  This share is at least IP_ABLE, and increases by
  * at most IP_ABLE per change. */

@@ -13,7 +13,7 @@ from impact_posture.impact.friction.unilateral_impact import StandingFeet, longe
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.system.arrays import Array
 
-# Longest contact time in the search for the time at which the weight keeps the feet in place, s.  No impact lasts
+# The search for the contact time at which the weight keeps the feet in place ends at this time, s.  No impact lasts
 # longer.
 _LONGEST = 0.1
 
