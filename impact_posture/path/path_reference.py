@@ -31,7 +31,7 @@ class PathPhase(IntEnum):
 class PathReference:
     """References of a controller along a path, which switch to the follow-through at the contact.
 
-    The run-up ends at the expected time of the contact.  If there is no contact yet, the references continue with the
+    The run-up ends at the expected time of the contact.  Until the contact, the references continue with the
     velocity of the impact for at most the time ``late``.  The contact is noticed at the first of three events:
 
     1. A measured force exceeds ``felt``.

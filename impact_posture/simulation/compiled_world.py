@@ -109,7 +109,7 @@ class CompiledWorld:
 def compiled_world(world: World, tick: CompiledTick | None, count: int) -> CompiledWorld | None:
     """Return the C loop for a world after its reset, or ``None`` if Python must run the ticks.
 
-    Python runs the ticks if there is no C controller, or if the loop cannot be compiled (for example, without MuJoCo
+    Python runs the ticks without a C controller, and if the loop cannot be compiled (for example, without MuJoCo
     headers).  Python also runs worlds with more than 64 rotors and worlds that :meth:`World.in_c` excludes.
     """
     contents = None if tick is None else world.in_c(count)

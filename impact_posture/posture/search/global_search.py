@@ -100,7 +100,7 @@ class GlobalSearch:
         return (
             f"self-motion followed on {pieces}: no posture there is better by more than {100 * self.bound.gap:.2g} % "
             f"({self.word}); {missed} missed the best posture; the last {self.motion.unsuccessful} of "
-            f"{self.motion.starts} random postures found no new component"
+            f"{self.motion.starts} random postures led to no new component"
         )
 
     @property
