@@ -20,12 +20,14 @@ from impact_posture.path.row_interpolation import INTERPOLATION, RowInterpolatio
 from impact_posture.path.strike import RunUp, Strike, check_strike, run_up
 from impact_posture.path.timed_curve import TimedCurve
 from impact_posture.posture.approach.approach_speed import ApproachSpeed
+from impact_posture.posture.approach.attainable_speed import USABLE
 from impact_posture.posture.search.multistart import PostureSolution
 from impact_posture.system.arrays import Array
 
 # Why a path that was reached is not returned.
 _NOT_SMOOTH = "no smooth curve through the path satisfies the constraints"
-_EVERYWHERE = "velocity limits, joint limits and other constraints in every posture of the search"
+# What prevents a higher speed, if the program required the greatest speed.
+_EVERYWHERE = f"{USABLE:.0%} of the velocity limits, joint limits or other constraints in every posture of the search"
 # Largest number of optima to try, best first.
 _OPTIMA = 5
 # An optimum with a larger objective is struck instead if its speed exceeds the greatest speed so far by this factor.

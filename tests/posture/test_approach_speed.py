@@ -18,7 +18,7 @@ from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import Infeasible, InputError
 from impact_posture.posture.analysis.result_document import result_document
 from impact_posture.posture.approach.approach_speed import ApproachSpeed
-from impact_posture.posture.approach.attainable_speed import _RESERVED, _ROOM, AttainableSpeed
+from impact_posture.posture.approach.attainable_speed import _ROOM, USABLE, AttainableSpeed
 from impact_posture.posture.formulation.problem_file import Prepared, prepare
 from impact_posture.posture.manifold.feasible_start import feasible_start
 from impact_posture.posture.program.program_rows import ProgramRows
@@ -110,7 +110,7 @@ def fastest(posed: Prepared, q: Vector) -> float:
         count = nv - 6 if robot.floating else nv
         still, joints = np.zeros(nv - count), slice(model.nq - count, None)
         ahead, behind = (np.append(still, side[joints] / _ROOM) for side in room)
-        low, high = np.maximum(-_RESERVED * limit, -ahead), np.minimum(_RESERVED * limit, behind)
+        low, high = np.maximum(-USABLE * limit, -ahead), np.minimum(USABLE * limit, behind)
     A = np.column_stack([np.array(rows), arrives])
     bounds = [*zip(low, high, strict=True), (0, 1e3)]
     optimum = linprog(np.append(np.zeros(nv), -1.0), A_eq=A, b_eq=np.zeros(len(A)), bounds=bounds)

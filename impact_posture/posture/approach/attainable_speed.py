@@ -36,7 +36,7 @@ RUN_UP = 0.1
 # joint velocities change on the way.
 _ROOM = 1.1 * RUN_UP / 2
 # Share of the velocity limits that the impact of a strike may use, because some joints are faster before the impact.
-_RESERVED = 0.97
+USABLE = 0.97
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +133,7 @@ class AttainableSpeed:
         free &= ~held_rows(robot, requirements.hold).any(axis=0)
         self.free = np.flatnonzero(free)
         limit = robot.velocity_limits[self.free]
-        stated, most = limit < FASTEST, _RESERVED if requirements.strike else 1.0
+        stated, most = limit < FASTEST, USABLE if requirements.strike else 1.0
         self.scale, self.upper = np.where(stated, limit, 1.0), np.where(stated, most, np.inf)
         self.moves = self._coupling[:, self.free] * self.scale
         self.names = [robot.tangent_names[k] for k in self.free]
