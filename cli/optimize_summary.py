@@ -96,7 +96,8 @@ def summarize(page: Page, prepared: Prepared, solution: PostureSolution, documen
     optima = listed([f"{value} ({count}×)" for value, count in hits.items()])
     left = solution.dominated_starts
     page.line(
-        f"{solution.certified_starts} of {solution.starts} starts certified in {solution.solve_time_s:.1f} s; "
+        f"{solution.certified_starts} of {solution.starts} solves by IPOPT certified "
+        f"in {solution.solve_time_s:.1f} s; "
         + (f"{left} stopped early (--finish-all finishes them); " if left else "")
         + f"optima: {optima}"
     )

@@ -22,7 +22,7 @@ CASES = {
     "talos, hand": ("talos --frame gripper_right_base_link --normal -1 0 0", 2.5, 5.0),
 }
 # Text in the last line of the printed answer.
-_ANSWER = b"starts certified in"
+_ANSWER = b"solves by IPOPT certified in"
 
 
 class Run(NamedTuple):
