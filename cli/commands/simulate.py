@@ -187,6 +187,9 @@ def _numbers(metrics: dict[str, Any], prediction: dict[str, Any]) -> list[tuple[
     saturation = metrics["saturation_s"]
     joints = f"base {number(metrics['q_total_impact_base'])}, joints {number(metrics['q_total_impact_joints'])}"
     rows = [("q_total_impact", f"{number(metrics['q_total_impact'])}  ({joints}; rad, mixed with m)")]
+    restitution = [] if prediction["restitution"] is None else [
+        ("restitution", f"{number(prediction['restitution'])} from the contact law; the predicted jump contains it")
+    ]  # fmt: skip
     if metrics["q_total_dwell"]:
         rows.append(("q_total_dwell", number(metrics["q_total_dwell"])))
     return [
@@ -198,6 +201,7 @@ def _numbers(metrics: dict[str, Any], prediction: dict[str, Any]) -> list[tuple[
         ),
         ("peak, recovery", number(metrics["peak_recovery"])),
         ("predicted jump", _rigid(prediction)),
+        *restitution,
         ("H before", number(prediction["H"], missing="–")),
         ("peak force", f"{number(metrics['peak_force'])} N"),
         ("saturated", f"{number(saturation['inside'])} s in the windows, {number(saturation['outside'])} s outside"),

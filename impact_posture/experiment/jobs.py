@@ -209,7 +209,8 @@ def _mean_prediction(impacts: list[Prediction]) -> Document:
     The loads are combined by :func:`~impact_posture.impact.evaluation.impact_effect.mean_load`.
     """
     means: Document = {"impacts": len(impacts)}
-    for key in ("H", "G", "V", "S", "approach", "frictionless", "sticking", "coulomb", "measured", "ratio"):
+    numbers = ("approach", "restitution", "frictionless", "sticking", "coulomb", "measured", "ratio")
+    for key in ("H", "G", "V", "S", *numbers):
         values = [getattr(impact, key) for impact in impacts]
         means[key] = None if not values or None in values else float(np.mean(values))
     for key in ("predicted_impact", "measured_impact"):

@@ -68,7 +68,9 @@ def run_content(folder: Path, document: Document, view: RunView, job: Job) -> Co
         H = number(document["prediction"]["H"])
         rows.append(("H before", H, "jump²/(N·s)²", "jump² per impulse² at the impacts"))
         if loads := load_rows(document["prediction"]):
-            title = "In the pushes" if view.pushed else f"Within {AFTER_TOUCH}"
+            e = document["prediction"].get("restitution")
+            law = "" if e is None else f" (prediction with the restitution {number(e)} of the contact law)"
+            title = "In the pushes" if view.pushed else f"Within {AFTER_TOUCH}{law}"
             tables.append(Table(title, ("", "measured", "rigid prediction", "unit", "meaning"), tuple(loads)))
     return Content(
         title=run_header([view])[0],

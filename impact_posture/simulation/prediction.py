@@ -8,6 +8,7 @@ import numpy as np
 
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.impact.evaluation.impact_effect import ImpactLoad, impact_effect
+from impact_posture.impact.evaluation.velocity_jump import normal_jump
 from impact_posture.impact.friction.coulomb_impact import coulomb_impact
 from impact_posture.impact.impact_contact import point_on
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
@@ -30,11 +31,12 @@ class Prediction:
         S: Squared jump per squared approach speed if the contact sticks; ``None`` if S is undefined.
         approach: Approach speed ``v`` of robot and surface (or ball) just before the impact, m/s.  For pushes, the
             impulse of the push, N·s.
-        frictionless: Predicted jump without friction and rebound, ``v √V``.  For pushes, ``√H`` times the impulse:
-            the velocity of a robot without controller at the end of the push.
-        sticking: Predicted jump if the contact sticks, ``v √S``, for an approach along the normal; ``None`` for
-            pushes and if S is undefined.
-        coulomb: Predicted jump with the friction of the surface, ``v √C``, for an approach along the normal;
+        restitution: Coefficient of restitution ``e`` of the surface (or ball) at this speed; ``None`` for pushes.
+        frictionless: Predicted jump without friction, ``(1+e) v √V``.  For pushes, ``√H`` times the impulse: the
+            velocity of a robot without controller at the end of the push.
+        sticking: Predicted jump if the contact sticks, ``(1+e) v √S``, for an approach along the normal; ``None``
+            for pushes and if S is undefined.
+        coulomb: Predicted jump with the friction of the surface, ``(1+e) v √C``, for an approach along the normal;
             ``None`` for pushes.
         measured: Measured jump (``peak_jump`` in :class:`~impact_posture.simulation.metrics.Metrics`).
         ratio: ``measured`` divided by ``coulomb`` (for pushes, by ``frictionless``); ``None`` if the divisor is
@@ -50,6 +52,7 @@ class Prediction:
     V: float
     S: float | None
     approach: float
+    restitution: float | None
     frictionless: float
     sticking: float | None
     coulomb: float | None
@@ -60,7 +63,11 @@ class Prediction:
 
 
 def predict(setup: Setup, objective: WorstCaseObjective, run: Run) -> tuple[Prediction, ...]:
-    """Predict each impact of a run with the rigid-body model at the last state before the impact."""
+    """Predict each impact of a run with the rigid-body model at the last state before the impact.
+
+    The contact law of the surface (or ball) determines the restitution
+    (:meth:`~impact_posture.simulation.world.contact_law.ContactLaw.restitution`).
+    """
     scenario, predictions = setup.scenario, []
     numeric = Numeric(setup.robot.model)
     point = point_on(setup.robot, objective.contact.frame, objective.contact.offset)
@@ -70,7 +77,7 @@ def predict(setup: Setup, objective: WorstCaseObjective, run: Run) -> tuple[Pred
         k = before(run.series, window)
         q, v = run.series.q[k], run.series.v[k]
         here = objective.oracle.quantities(q)
-        sticking, force = None, None
+        sticking = force = restitution = None
         if scenario.push:
             force = float(np.linalg.norm(scenario.push.force))
             impulse = approach = force * scenario.push.duration
@@ -78,21 +85,26 @@ def predict(setup: Setup, objective: WorstCaseObjective, run: Run) -> tuple[Pred
             smooth, coulomb = approach * float(np.sqrt(here.H)), None
         elif scenario.throw:
             approach = scenario.throw.speed - float(scenario.normal @ numeric.at(q).jacobian(point)[:3] @ v)
-            smooth, sticking, coulomb = thrown_jumps(objective.oracle, q, scenario.throw, approach)
-            pushed = thrown_impulses(objective.oracle, q, scenario.throw, approach)[-1]
+            restitution = scenario.throw.restitution(approach, scenario.physics.timestep)
+            rebound = normal_jump(approach, restitution)
+            smooth, sticking, coulomb = thrown_jumps(objective.oracle, q, scenario.throw, rebound)
+            pushed = thrown_impulses(objective.oracle, q, scenario.throw, rebound)[-1]
             velocity, impulse = objective.oracle.solve(objective.oracle.J.T @ pushed), float(here.normal @ pushed)
         else:
             approach = float(-scenario.normal @ numeric.at(q).jacobian(point)[:3] @ v)
-            smooth = approach * float(np.sqrt(here.V))
-            sticking = None if here.S is None else approach * float(np.sqrt(here.S))
+            restitution = scenario.surface.restitution(approach, scenario.physics.timestep)
+            rebound = normal_jump(approach, restitution)
+            smooth = rebound * float(np.sqrt(here.V))
+            sticking = None if here.S is None else rebound * float(np.sqrt(here.S))
             impact = coulomb_impact(objective.oracle, q)
-            velocity, impulse = approach * impact.jump, approach * impact.mass
-            coulomb = approach * float(np.sqrt(impact.jump @ objective.oracle.weigh(impact.jump)))
+            velocity, impulse = rebound * impact.jump, rebound * impact.mass
+            coulomb = rebound * float(np.sqrt(impact.jump @ objective.oracle.weigh(impact.jump)))
         expected = smooth if coulomb is None else coulomb
         effect, measured = impact_effect(setup.robot, velocity), impact_load(setup, run.series, window)
         predicted = ImpactLoad(**vars(effect), impulse=impulse, peak_force=force, jump=expected)
         ratio = measured.jump / expected if expected > 1e-9 else None
         jumps = smooth, sticking, coulomb, measured.jump
         rigid = here.H, here.G, here.V, here.S
-        predictions.append(Prediction(window.contact, *rigid, approach, *jumps, ratio, predicted, measured))
+        comparison = ratio, predicted, measured
+        predictions.append(Prediction(window.contact, *rigid, approach, restitution, *jumps, *comparison))
     return tuple(predictions)

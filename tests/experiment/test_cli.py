@@ -50,6 +50,8 @@ def test_simulate(aerial: Path, tmp_path: Path) -> None:
         assert isinstance(result["metrics"][key], int | float)
     assert json.loads((tmp_path / "run" / "run.json").read_text()) == result
     measured, predicted = (result["prediction"][key] for key in ("measured_impact", "predicted_impact"))
+    # The wall of the scenario has the restitution 0.125.
+    assert 0.1 < result["prediction"]["restitution"] < 0.15
     for key in ("base_linear", "base_angular", "joint", "impulse"):
         assert measured[key] == result["metrics"][key] and type(predicted[key]) is type(measured[key])
     assert 0.3 < measured["impulse"] / predicted["impulse"] < 3 and measured["joint"]["share"] > 0
@@ -57,6 +59,7 @@ def test_simulate(aerial: Path, tmp_path: Path) -> None:
     page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
     assert (
         "rigid prediction" in page
+        and f"prediction with the restitution {result['prediction']['restitution']:.3g} of the contact law" in page
         and f"{measured['joint']['name']}: {measured['joint']['velocity']:.3g} rad/s" in page
     )
     series = Series.load(tmp_path / "run" / "series.npz")

@@ -62,8 +62,8 @@ def test_speed_time_and_jump_of_the_contacts_are_as_planned() -> None:
     for window, prediction, at in zip(windows, predictions, expected(factory), strict=True):
         assert abs(window.begin - at) < 0.01
         assert prediction.approach == pytest.approx(0.5, rel=0.05)
-        # The surface has the restitution 0.13, which the prediction does not contain.
-        assert prediction.ratio == pytest.approx(1.0, abs=0.15)
+        # The prediction contains the restitution 0.13 of the surface.
+        assert prediction.ratio == pytest.approx(1.0, abs=0.05)
         # The posture at the contact is the planned one, up to the lag of the soft posture task.  No motor is at its
         # limit before.
         k = int(np.searchsorted(record.series.t, window.begin)) - 1

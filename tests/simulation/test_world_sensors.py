@@ -168,6 +168,26 @@ def test_restitution_agrees_with_the_page() -> None:
         assert f"{bounce.duration * 1e3:.1f} ms" == row[6].strip()
 
 
+@pytest.mark.parametrize(
+    ("law", "speed", "timestep"),
+    [
+        (ContactLaw(), 0.1, 2.5e-4),
+        (ContactLaw(solref=(0.004, 0.3)), 1.0, 5e-4),
+        (ContactLaw(solref=(-1e5, -100.0), solimp=(0.5, 0.9, 0.01)), 0.5, 2.5e-4),
+    ],
+)
+def test_the_restitution_of_a_law_agrees_with_a_ball_in_mujoco(
+    law: ContactLaw, speed: float, timestep: float
+) -> None:
+    measured = measure_restitution(law, speed=speed, timestep=timestep).restitution
+    assert law.restitution(speed, timestep) == pytest.approx(measured, rel=1e-9) and measured > 0.05
+
+
+def test_nothing_rebounds_without_an_approach_or_from_a_law_without_a_spring() -> None:
+    assert ContactLaw().restitution(0.0, 2.5e-4) == ContactLaw().restitution(-0.1, 2.5e-4) == 0.0
+    assert ContactLaw(solref=(-1e-6, -1e3)).restitution(0.5, 2.5e-4) == pytest.approx(0.0, abs=1e-9)
+
+
 @pytest.mark.parametrize("damping", [0.2, 0.6, 1.0, 1.8])
 def test_restitution_converges_to_the_ideal_spring(damping: float) -> None:
     ideal, errors = ideal_restitution(damping), []

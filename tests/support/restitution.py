@@ -12,15 +12,13 @@ from impact_posture.errors import InputError
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_spec import RobotSpec
 from impact_posture.simulation.world.actuator_command import ActuatorCommand
-from impact_posture.simulation.world.contact_law import ContactLaw
+from impact_posture.simulation.world.contact_law import PHASES, ContactLaw
 from impact_posture.simulation.world.scene import Physics, Scene, Shape, Surface
 from impact_posture.simulation.world.world import World, build_world
 
 _RADIUS = 0.02
 # A contact that lasts longer than this number of time constants counts as a contact that never ends.
 _PATIENCE = 200
-# Fractions of a time step at which the first touch occurs; restitution depends slightly on this fraction.
-_PHASES = (0.1, 0.3, 0.5, 0.7, 0.9)
 
 
 @dataclass(frozen=True)
@@ -81,7 +79,7 @@ def measure_restitution(
     Raises:
         InputError: The ball stays on the surface, or the time step is too long for the law.
     """
-    bounces = [_one(law, speed, timestep, mass, phase) for phase in _PHASES]
+    bounces = [_one(law, speed, timestep, mass, phase) for phase in PHASES]
     restitutions = [b.restitution for b in bounces]
     return Bounce(
         restitution=float(np.mean(restitutions)),

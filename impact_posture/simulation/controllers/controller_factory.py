@@ -185,10 +185,14 @@ class ControllerFactory:
             InputError: The scenario has no contacts, or no strike is possible.
         """
         check_package()
-        setup, contacts = self.setup, self.setup.scenario.contacts
+        setup, scenario = self.setup, self.setup.scenario
         solution = replace(self._optimum("strike").solution, initial=setup.q)
         tell("looking for a path that strikes")
-        path = posture_path(solution, strike=0.0 if contacts is None else contacts.speed)
+        speed, restitution = 0.0, 0.0
+        if scenario.contacts is not None:
+            speed = scenario.contacts.speed
+            restitution = scenario.surface.restitution(speed, scenario.physics.timestep)
+        path = posture_path(solution, strike=speed, restitution=restitution)
         if path.strike is None:
             raise InputError(f"cannot strike: {path.reason}", where="strike", hint="change the start posture")
         return path

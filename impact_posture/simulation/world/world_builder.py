@@ -22,7 +22,7 @@ from impact_posture.impact.impact_contact import point_on
 from impact_posture.robot.actuation import actuation_matrix
 from impact_posture.robot.model_joints import joint_range
 from impact_posture.robot.robot import Robot
-from impact_posture.simulation.world.contact_law import ContactLaw
+from impact_posture.simulation.world.contact_law import SOLIMP_SHAPE, ContactLaw
 from impact_posture.simulation.world.mjcf_contacts import LinkGeom, add_link_geoms
 from impact_posture.simulation.world.scene import Physics, Scene, Shape, Surface
 from impact_posture.simulation.world.throw import BALL, Throw, add_ball
@@ -32,8 +32,6 @@ from impact_posture.system.optional_package import import_mujoco
 
 # Joint families whose velocities have the same meaning in Pinocchio and MuJoCo.
 _DRIVEN = ("revolute", "continuous", "prismatic", "translation", "spherical")
-# Last two numbers of ``solimp``: midpoint and power of the curve along which d rises (MuJoCo defaults).
-_SOLIMP_SHAPE = (0.5, 2.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +140,7 @@ def _add_pair(mjcf: Mjcf, first: str, second: str, law: ContactLaw) -> None:
         condim=3 if law.friction else 1,
         friction=(law.friction, law.friction, 0.0, 0.0, 0.0),
         solref=law.solref,
-        solimp=(*law.solimp, *_SOLIMP_SHAPE),
+        solimp=(*law.solimp, *SOLIMP_SHAPE),
     )
 
 
@@ -157,7 +155,7 @@ def _set_physics(spec: Any, physics: Physics) -> None:
     if physics.gravity is not None:
         spec.option.gravity = physics.gravity
     for joint in spec.joints:
-        joint.solref_limit, joint.solimp_limit = physics.stop_solref, (*physics.stop_solimp, *_SOLIMP_SHAPE)
+        joint.solref_limit, joint.solimp_limit = physics.stop_solref, (*physics.stop_solimp, *SOLIMP_SHAPE)
 
 
 def _set_passive(mjcf: Mjcf, robot: Robot) -> None:
