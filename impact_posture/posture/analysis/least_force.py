@@ -24,7 +24,7 @@ def least_effective_mass(
     compile: CompileMode = "auto",
     guesses: Sequence[Array] = (),
 ) -> PostureSolution:
-    """Minimize the effective mass, with friction, at the leading contact under the constraints of a problem.
+    """Minimize the effective mass, with friction, at the first contact under the constraints of a problem.
 
     For every contact stiffness, the posture with the least effective mass has the least peak force.  Arguments and
     errors are as in :func:`~impact_posture.posture.search.multistart.solve`.

@@ -4,16 +4,16 @@
 
     f(d) = min over q  objective(q)    subject to the constraints of the problem and price(q) ≤ d
 
-with bounds d from the least price to the price of the optimum.  The price is the distance ‖q ⊖ q₀‖ of
-:func:`~impact_posture.posture.constraints.posture_distance.distance_squared`, or the peak force of the impact.  The
-price is bounded and not penalized, because minimizers of ``objective + w·price`` give only points on the convex hull
-of the curve.
+The price is the distance ‖q ⊖ q₀‖ of :func:`~impact_posture.posture.constraints.posture_distance.distance_squared`,
+or the peak force of the impact.  Its bound d goes from the least price to the price of the optimum.  The price is
+bounded and not penalized, because minimizers of ``objective + w·price`` give only points on the convex hull of the
+curve.
 
-A single program has d as the bound of a row.  It is solved along two paths: outward from the posture with the least
-price, and inward from the optimum.  Each solve starts at the result of the previous solve.  If this result satisfies
-the new bound, the solve also uses the multipliers of the previous solve.  For each bound, the best certified result
-is kept.  If the best result for a neighboring bound comes from another path, one more solve starts from this result.
-The curve is therefore the lower envelope of the paths.
+One program solves for all d, because d is the bound of one of its rows.  The bounds are solved along two paths:
+outward from the posture with the least price, and inward from the optimum.  Each solve starts at the result of the
+previous solve.  If this result satisfies the new bound, the solve also uses the multipliers of the previous solve.
+For each bound, the best certified result is kept.  If the best result for a neighboring bound comes from another
+path, one more solve starts from this result.  The curve is therefore the lower envelope of the paths.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ from impact_posture.posture.search.growing_search import Progress, run_start
 from impact_posture.posture.search.multistart import PostureSolution
 from impact_posture.system.arrays import Array
 
-# Prices are treated as equal if they differ by less than this: a share of the force, or a distance in rad or m.
+# Two prices count as equal if their difference is below this value: relative for a force, in rad or m for a distance.
 _STILL = 1e-6
 # One posture is better than another if its objective is lower by more than this fraction of the initial objective.
 _EQUAL = 1e-9
 # If the objective increases along the curve by more than this fraction of the initial objective, a note is added.
 _RISE = 1e-6
-# Maximum number of optima, other than the best, from which a path starts.
+# Maximum number of optima, besides the best optimum, from which a path starts.
 _PATHS = 3
 # Maximum number of rounds that start from results for neighboring bounds.
 _ROUNDS = 3
@@ -65,11 +65,11 @@ def pareto_front(
     compile: CompileMode = "auto",
     progress: Progress | None = None,
 ) -> TradeOff:
-    """Compute the trade-off curve in ``points`` equal steps from the least price to the price of the optimum.
+    """Compute the trade-off curve in ``points`` equal steps of the price, which is the distance or the peak force.
 
     The regularization is left out, because the bound on the distance replaces it.  ``force`` contains the contact and
-    the approach speed (m/s) that determine the peak force as the price; if it is ``None``, the price is the distance.
-    ``progress`` is called with the numbers of finished and planned solves.
+    the approach speed (m/s), from which the peak force is computed.  If ``force`` is ``None``, the price is the
+    distance.  ``progress`` is called with the numbers of finished and planned solves.
 
     Raises:
         InputError: The number of points is below 1, or the price is the force and there are several contacts.
@@ -115,7 +115,7 @@ def _bounded(problem: ConstrainedProblem, price: TradeOffPrice) -> ConstrainedPr
 
 @dataclass(frozen=True, eq=False)
 class _End:
-    """The result of a solve: the name of its path, and the point."""
+    """The result of a solve, and the name of the path to which the solve belongs."""
 
     path: str
     point: TradePoint
@@ -177,7 +177,7 @@ class _Curve:
                 break
 
     def _try_neighbors(self, order: range, neighbor: int) -> bool:
-        """Solve from the result of a neighbor if it is on another path or better; return whether a point improved."""
+        """Solve from a neighbor's result if its path differs or it is better; return whether a point improved."""
         better = False
         for k in order:
             best, other = self._best[k], self._best[k + neighbor]
@@ -256,7 +256,7 @@ class _Curve:
         open_bounds = [f"{p.within:.3g}" for p in points if not p.certified]
         if open_bounds:
             count = f"{len(open_bounds)} of {len(points)} points"
-            notes.append(f"trade-off: {count} are not certified, within {', '.join(open_bounds)}")
+            notes.append(f"trade-off: {count} are not certified: within {', '.join(open_bounds)}")
         risen = [b for a, b in pairwise(points) if b.objective > a.objective + _RISE * self._scale]
         if risen:
             notes.append(

@@ -1,4 +1,4 @@
-"""Warnings about an optimal or reachable posture that cannot be held or crosses a surface."""
+"""Warnings about an optimal or reachable posture that the robot cannot hold or that crosses a surface."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _BEHIND = 0.01
 def posture_warnings(
     prepared: Prepared, initial: Array, q: Array, holding: HoldingForces | None, name: str = "optimal"
 ) -> list[str]:
-    """Return warnings about holding forces, surface and ground for a posture ``q``, with its ``name`` in the texts.
+    """Return warnings about holding forces, surface and ground for a posture ``q``; the texts call it ``name``.
 
     ``holding`` are the forces that hold this posture; ``None`` if unknown.
     """
@@ -39,7 +39,7 @@ def posture_warnings(
 
 
 def _balance_warnings(prepared: Prepared, q: Array, posture: str) -> list[str]:
-    """Warn about a center of mass that is not above the feet; no constraint keeps it there."""
+    """Warn about a center of mass that is not above the feet, if no constraint keeps it there."""
     robot, supports = prepared.impact.robot, prepared.impact.supports
     if not supports:
         return []
@@ -61,7 +61,7 @@ def _balance_warnings(prepared: Prepared, q: Array, posture: str) -> list[str]:
 
 
 def _surface_warnings(prepared: Prepared, initial: Array, q: Array, posture: str) -> list[str]:
-    """Warn about joints or links that lie behind the contact plane; no constraint keeps them in front of it."""
+    """Warn about joints or links behind the contact plane, if no constraint keeps them in front of this plane."""
     requirements = prepared.problem.requirements
     # With a free contact pose, an object pushes the robot, so there is no surface.
     if requirements.contact_pose == "free" or requirements.surface == "none":
@@ -96,7 +96,7 @@ def _behind(prepared: Prepared, q: Array) -> list[str]:
 
 
 def _ground_warnings(prepared: Prepared, q: Array, posture: str) -> list[str]:
-    """Warn about joints or links that lie below the lowest foot; no constraint keeps them above flat ground."""
+    """Warn about joints or links below the lowest foot, if no constraint keeps them above flat ground."""
     robot, supports = prepared.impact.robot, prepared.impact.supports
     if not supports:
         return []
@@ -113,8 +113,8 @@ def _ground_warnings(prepared: Prepared, q: Array, posture: str) -> list[str]:
 def _origins(prepared: Prepared, numeric: Numeric) -> list[tuple[int, str, Array]]:
     """Return joint index, name and world origin of the links or joints that no collision constraint keeps apart.
 
-    These are the links without shapes.  If no link has a shape, or if there are no collision constraints, these are
-    all joints.
+    The result contains the links without shapes.  If no link has a shape, or if there are no collision constraints,
+    the result contains all joints.
     """
     robot, around = prepared.impact.robot, prepared.problem.surroundings
     if around is not None and around.shapes.bodies:

@@ -63,7 +63,7 @@ def result_document(
         }
         for name, evaluation in evaluations.items()
     }
-    # The posture of posture.json, to which the verdict refers.
+    # The posture in posture.json, for which the verdict is computed.
     answer = list(postures)[-1]
     struck = path is not None and "strike" in path
     fastest = path["strike"]["speed"] if struck else attainable[answer]  # type: ignore[index]

@@ -33,9 +33,9 @@ _NOISE = 1e-6
 class VariantOptimum(JsonBlock):
     """A model variant and its own optimum, which is the best posture for this variant alone.
 
-    ``at_robust`` is the objective of the variant at the robust optimum.  ``own_optimum`` is its objective at its own
-    optimum ``own_q``, shape (nq,).  ``moved`` is the tangent distance between the robust optimum and ``own_q``.
-    ``own_optimum``, ``own_q`` and ``moved`` are ``None`` if no start ended at a certified posture.
+    ``at_robust`` is the objective of the variant at the robust optimum.  ``own_optimum`` is the objective of the
+    variant at its own optimum ``own_q``, shape (nq,).  ``moved`` is the tangent distance between the robust optimum
+    and ``own_q``.  ``own_optimum``, ``own_q`` and ``moved`` are ``None`` if no start ended at a certified posture.
     """
 
     name: str
@@ -51,8 +51,8 @@ class Robustness:
 
     Attributes:
         model_variants: All model variants; the nominal model is the first.
-        worst_robust: Worst objective of all model variants at the robust optimum.
-        worst_nominal: Worst objective of all model variants at the optimum of the nominal model; ``None`` if this
+        worst_robust: Largest objective of any model variant at the robust optimum.
+        worst_nominal: Largest objective of any model variant at the optimum of the nominal model; ``None`` if this
             optimum does not exist, or violates a constraint for another model variant.
         broken: Names of the constraints of the robust problem that the optimum of the nominal model violates.
         between: Largest objective at the robust optimum for the random models between the model variants.
@@ -78,7 +78,7 @@ class Robustness:
 
     @property
     def gain(self) -> float | None:
-        """Relative decrease of the worst objective from the nominal optimum to the robust optimum."""
+        """Relative decrease of the largest objective of any variant, from the nominal to the robust optimum."""
         return None if self.worst_nominal is None else 1 - self.worst_robust / self.worst_nominal
 
     @property

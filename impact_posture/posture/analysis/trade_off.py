@@ -1,4 +1,4 @@
-"""Points and knee of the trade-off between the objective and the distance from the initial posture, or the force."""
+"""Points and knee of the trade-off between objective and distance from the initial posture, or peak force."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from impact_posture.config.problem_settings import Against
 from impact_posture.posture.program.certificate import Certificate
 from impact_posture.system.arrays import Array
 
-# A point is a knee only if its fraction of the total gain exceeds its fraction of the total distance by at least this
+# A point is a knee only if its fraction of the largest gain exceeds its fraction of the largest distance by this
 # value.  For a parabola, which every smooth optimum resembles, the excess is at most 1/4, so a parabola has no knee.
 KNEE = 1 / 3
 
@@ -25,8 +25,8 @@ class TradePoint(JsonBlock):
         distance: Distance or force of the posture; it is below ``within`` if a larger distance or force does not
             improve the objective.
         q: Posture, shape (nq,).
-        certificate: Optimality certificate of the problem with this bound.  Only one posture satisfies the bound of
-            the first point, so ignore the stationarity there.
+        certificate: Optimality certificate of the problem with this bound.  Stationarity has no meaning at the first
+            point, because only one posture satisfies its bound.
         first: Whether this is the first point, the only posture at the least distance or force.
     """
 

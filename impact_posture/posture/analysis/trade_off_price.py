@@ -1,4 +1,4 @@
-"""The prices that a trade-off can bound: the distance from the initial posture, and the peak force."""
+"""What a trade-off can bound ("price"): the distance from the initial posture, or the peak force."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class DistancePrice:
     """The distance from the initial posture, rad mixed with m.
 
     ``nearest`` is the posture with the least price, shape (nq,).  ``against`` is the name of the price in options and
-    files.  ``nothing`` is the message for the case that the optimum already has the least price.
+    files.  ``nothing`` is the message if the optimum already has the least price.
     """
 
     model: pin.Model

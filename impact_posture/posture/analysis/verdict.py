@@ -125,7 +125,7 @@ def _sentence(outcome: str, refuted: bool, later: bool) -> str:
 def _unilateral(
     impact: ResolvedImpact, evaluations: tuple[Evaluation, Evaluation], held: tuple[PredictedImpact, PredictedImpact]
 ) -> tuple[PredictedImpact, PredictedImpact] | None:
-    """Return the predictions for feet that lift or slide; ``None`` if the effects are the same as with held feet."""
+    """Return the predictions for feet that lift or slide; ``None`` if the effects equal those with fixed feet."""
     first, last = (evaluation.standing for evaluation in evaluations)
     if first is None or last is None:
         return None
@@ -200,7 +200,7 @@ def _slip(jump: Jump) -> str:
 
 
 def _linear_force(impact: ResolvedImpact, sides: tuple[PredictedImpact, PredictedImpact]) -> float | None:
-    """Return the relative change of the peak force of a linear contact; ``None`` for several contacts."""
+    """Return the relative change of the peak force ``F ∝ √m`` of a linear contact; ``None`` for several contacts."""
     return None if impact.objective.others else sqrt(sides[1].impulse / sides[0].impulse) - 1
 
 
@@ -218,8 +218,8 @@ def _better_objective(impact: ResolvedImpact, outcome: str, jumps: tuple[Jump, J
     grown = relative_change(jumps[0].norm, jumps[1].norm) > -SAME
     if (grown or outcome in ("worse", "no better")) and objective.kind != "coulomb" and not objective.others:
         kind = "sticking" if objective.normal_cone_deg else "coulomb"
-        # If the contact sticks at both postures, S measures the jump.  At friction 0, V measures the jump.  If the
-        # objective is already S or V in these cases, another objective is not better.
+        # If the contact sticks at both postures, S is the squared jump.  Without friction, V is the squared jump.  If
+        # the objective is this quantity already, no other objective is better.
         slides = impact.contact.friction == 0
         sticks = all(isinstance(jump, CoulombJump) and jump.sticks for jump in jumps)
         same = (kind, "speed" if slides else "", "sticking" if sticks else "")

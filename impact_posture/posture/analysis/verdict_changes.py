@@ -59,10 +59,10 @@ class Change:
 def changes(
     before: ImpactLoad, after: ImpactLoad, speed: float, force: float | None = None, where: str = ""
 ) -> tuple[Change, ...]:
-    """Return the changes from one impact to another; ``speed`` is the approach speed, m/s.
+    """Return the changes from the impact ``before`` to the impact ``after``; ``speed`` is the approach speed, m/s.
 
-    ``force`` is the relative change of the peak force of a linear contact, for impacts of unknown peak force.
-    ``where`` names the contact of the impulse if there are several.
+    ``force`` is the relative change of the peak force of a linear contact; it is used if the peak forces are unknown.
+    ``where`` names the contact if there are several.
     """
     return (*_velocities(before, after, FELT * speed), *_contact(before, after, force, where))
 
@@ -125,9 +125,9 @@ def in_words(change: float) -> str:
 
 
 def outcome_of(parts: tuple[Change, ...]) -> str:
-    """Return the outcome: ``better`` if something falls and nothing grows, or a text on what falls and grows."""
+    """Return the outcome: ``better`` if a quantity falls and none grows, or a text on what falls and grows."""
     grow, fall = _sides([part for part in parts if part.grows]), _sides([part for part in parts if part.falls])
-    # If one quantity of a side falls and another grows, the side counts only as growing.
+    # A side with a quantity that falls and a quantity that grows counts only as growing.
     fall = [side for side in fall if side not in grow]
     if not grow:
         return "better" if fall else "no better"
@@ -137,7 +137,7 @@ def outcome_of(parts: tuple[Change, ...]) -> str:
 
 
 def _sides(parts: list[Change]) -> list[Side]:
-    """Return the sides of changes without repetition; the impulse is only named if the force is not."""
+    """Return the distinct sides of the changes; ``impulse`` is left out if ``force`` is among them."""
     sides = list(dict.fromkeys(part.side for part in parts))
     return [side for side in sides if side != "impulse" or "force" not in sides]
 

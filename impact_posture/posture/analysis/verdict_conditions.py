@@ -15,9 +15,10 @@ from impact_posture.impact.resolved_impact import ResolvedImpact
 # the verdict shows only three digits of both speeds.
 _REACHED = 5e-3
 # Largest travel of the contact point in the compression time, m, for which the posture is treated as constant.  Up to
-# this travel, jumps in `make study-verdict` are within 5 % of the simulation or 1 % of the approach speed.
+# this travel, predicted jumps differ from the simulation by at most 5 %, or 1 % of the approach speed (`make
+# study-verdict`).
 LONG_TRAVEL = 0.015
-# Hint if the joints are too slow and no path strikes.
+# Hint if the joints are too slow for the approach speed and no path with an impact was computed.
 _SLOW = "add `approach`, or correct the `speed`"
 # A distance between postures (rad, m) up to this value is a rounding error.
 _STILL = 1e-6
@@ -31,7 +32,7 @@ class Condition(JsonBlock):
         key: ``path``, ``arrival``, ``singular``, ``feet``, ``contact point``, ``contact time`` or ``start``.
         line: The condition in words, without a full stop.
         hint: What the user can do; empty if there is nothing to do.
-        refutes: Whether the verdict has no meaning, because the condition does not hold.
+        refutes: Whether the verdict has no meaning because this condition does not hold.
     """
 
     key: str
@@ -42,14 +43,14 @@ class Condition(JsonBlock):
 
 @dataclass(frozen=True)
 class Circumstances:
-    """Data of an optimization other than the impacts in the initial and the optimal posture.
+    """Data of an optimization on which the conditions depend, besides the two predicted impacts.
 
     Attributes:
         attainable: Highest speed at which the joints can bring the contact to the surface in the optimal posture,
             m/s; ``None`` if unknown or unbounded.
         moved: Distance from the given to the initial posture, rad mixed with m.
         no_path: Why no path leads to the optimum, and where the path ends; empty if it ends at the optimum.
-        strikes: Whether ``attainable`` is the speed of a path that strikes.
+        strikes: Whether ``attainable`` is the speed at the end of a computed path that strikes the surface.
     """
 
     attainable: float | None = None

@@ -31,11 +31,11 @@ from impact_posture.system.arrays import Array, independent_rows
 FASTEST = 1e3
 # Shortest duration of a run-up, s, which a controller can follow.
 RUN_UP = 0.1
-# Room of a joint for a run-up, s: the time in which the joint crosses this room at its velocity in the impact.  The
-# speed of a run-up rises from rest, so the shortest run-up needs half of its duration.  A tenth is added, because the
-# joint velocities change on the way.
+# A joint with the velocity ν at the impact needs the distance ``_ROOM · ν`` for its run-up; ``_ROOM`` is in s.  The
+# velocity rises from rest, so its mean is about ν/2.  A tenth is added, because the velocity does not rise exactly
+# linearly.
 _ROOM = 1.1 * RUN_UP / 2
-# Share of the velocity limits that the impact of a strike may use, because some joints are faster before the impact.
+# Fraction of the velocity limits that a strike may use at the impact; some joints are faster before the impact.
 USABLE = 0.97
 
 
@@ -108,15 +108,15 @@ class AttainableSpeed:
     ``contact_pose`` is ``free`` is left out, because there an object hits the robot.
 
     For a strike (:attr:`Requirements.strike`), the joints also need room for a run-up: ``q_i − ν_i t`` is within the
-    joint limits.  ``t`` is slightly longer than half of the shortest run-up.  A small share of the velocity limits is
-    left to the run-up.
+    joint limits.  The time ``t`` is slightly longer than half of the shortest run-up.  A strike may use only the
+    fraction :data:`USABLE` of the velocity limits.
 
     Attributes:
         unknown: Reason why the speed is not computed; empty if it is computed.  A computed speed can still be
             infinite at some postures.
         free: Indices of the free velocities, the entries of ``ν`` that may be nonzero, shape (k,).
         scale: Unit of each free velocity, rad/s or m/s, shape (k,).
-        moves: Map from the free velocities in this unit to ``ν``, which includes followers, shape (nv, k).
+        moves: Matrix from the free velocities in this unit to ``ν``, including coupled joints, shape (nv, k).
         upper: Limit of each free velocity in this unit, shape (k,); infinite if the URDF has no limit.
         roomy: Indices, in ``free``, of the joints that need room for a run-up, shape (r,).
         lowest, highest: Position limits of these joints with the margin, rad or m, shape (r,).

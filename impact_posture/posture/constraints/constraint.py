@@ -38,8 +38,8 @@ class LiftedRows:
         variables: Symbols of ``z``, shape (k, 1).
         slack: Sum of the entries of ``z`` that relax rows, m; a penalty drives this sum to zero.
         sides: Further rows that depend only on ``z``, not on ``q``, shape (p, 1).
-        pieces: Pieces that are joined to this constraint; the expressions of unchanged pieces are reused when the
-            constraint grows.
+        pieces: The parts that were joined, for example one for each pair of bodies; the expressions of unchanged
+            pieces are reused when the constraint grows.
     """
 
     rows: ca.SX

@@ -66,7 +66,7 @@ class ImpactBounds(Constraint):
         self._units = dict(zip(self._names, units, strict=True))
         self.lower = np.array([*[-np.inf] * len(mass), *[-jump] * count])
         self.upper = np.array([*mass, *[jump] * count])
-        # Covector c and share s of each row, whose value is cᵀΔν + s m.
+        # Each row has the value cᵀΔν + s m, with its covector c and its factor s (0 or 1).
         self._covectors = np.vstack([np.zeros((len(mass), robot.nv)), np.eye(robot.nv)[self._joints]])
         self._shares = np.array([*[1.0] * len(mass), *[0.0] * count])
 
@@ -119,7 +119,7 @@ class ImpactBounds(Constraint):
         return np.asarray(self._covectors @ impact.jump + impact.mass * self._shares)
 
     def linearize(self, model: Numeric, auxiliaries: Array) -> Linearization:
-        """Linearize the bounded quantities as functions of the posture; the auxiliaries do not appear.
+        """Linearize the bounded quantities as functions of the posture, with the auxiliary unknowns eliminated.
 
         Where the contact point begins to slip, the rows for sticking and for sliding are both included, because the
         quantities have a kink there.
@@ -132,7 +132,7 @@ class ImpactBounds(Constraint):
                 sides.append((value, impact_gradients(oracle, model.q, other, self._covectors, self._shares)))
         values, slopes = (np.concatenate(parts) for parts in zip(*sides, strict=True))
         lower, upper = (np.tile(side, len(sides)) for side in (self.lower, self.upper))
-        # The certificate expects a column for each auxiliary.
+        # The certificate expects a column for each auxiliary unknown.
         auxiliary = np.zeros((len(values), len(auxiliaries)))
         return Linearization(self._names * len(sides), values, lower, upper, slopes, auxiliary)
 

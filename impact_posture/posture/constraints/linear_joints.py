@@ -1,4 +1,4 @@
-"""Linear constraints on joints: links whose convex hulls overlap do not touch, and followers move with leaders."""
+"""Linear constraints on joints: keep links with overlapping hulls apart, and let coupled joints move together."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ class _Wall:
 
 
 class Surroundings:
-    """The bodies around a robot at a given posture, and the constraints that keep the links away from them.
+    """The bodies around a robot at a given posture, and the constraints that keep the links away from these bodies.
 
     ``numeric`` is the model at the given posture.  ``held`` are joints that do not move.  ``clearance`` is the least
     allowed distance of all pairs, m.
@@ -113,8 +113,8 @@ class Surroundings:
         plane = replace(through, offset=-depth)
         beside = [foot for foot in feet if abs(self._above(foot, plane)) < _BESIDE]
         for other in contacts:
-            # Links of the same kind, such as two hands, extend equally far behind their contact points, so their
-            # surfaces coincide.  A contact is therefore also tested against the plane through the contact point.
+            # Two equal links, such as two hands, extend equally far behind their contact points, so their surfaces
+            # coincide.  The other contact is therefore also tested against the plane through this contact point.
             facing = self._world_normal(contact) @ self._world_normal(other) > _PARALLEL
             at = point_on(self.robot, other.frame, other.offset)
             if any(abs(self._above(at, face)) < _BESIDE for face in ((plane, through) if facing else (plane,))):

@@ -19,15 +19,15 @@ def impact_constraints(
 ) -> list[Constraint]:
     """Return the bounds on the impact and the constraints on the feet for all model variants.
 
-    Friction cones are convex.  Therefore, if the feet stay in place for an impact at each single contact, the feet
-    also stay for impacts at all contacts at once.  A payload moves the center of mass.  The constraint on the center
-    of mass, if ``constraints`` contains it, is therefore repeated for each model with a payload.
+    It suffices that the feet stay in place for an impact at each single contact.  They then also stay for impacts at
+    all contacts at once, because friction cones are convex.  A payload moves the center of mass.  The constraint on
+    the center of mass, if ``constraints`` contains it, is therefore repeated for each model with a payload.
 
     Raises:
         InputError: The feet must stay in place, but the contacts can also pull.
     """
     if requirements.keep_contacts and objective.bilateral:
-        fault = "with contacts that pull as well as push, the feet stay only if they get no impulse"
+        fault = "with contacts that pull as well as push, the feet stay only if no impulse acts on them"
         raise InputError(fault, where="keep_contacts", hint="leave out `bilateral` or `keep_contacts`")
     added: list[Constraint] = []
     centers = [constraint for constraint in constraints if isinstance(constraint, CenterOfMassOverFeet)]

@@ -28,7 +28,7 @@ from impact_posture.robot.urdf import EXAMPLE_PREFIX
 from impact_posture.system.escape import toml
 
 _FILES = ("srdf", "config")
-# For each option on the command line, further keys of the file that the option replaces.
+# An option on the command line also replaces these keys of the file.
 _REPLACED_BY = {
     "frame": ("contact",),
     "normal": ("contact",),
@@ -37,7 +37,7 @@ _REPLACED_BY = {
     "contact_stiffness": ("contact_duration",),
     "posture": ("q",),
 }
-# Fields of Requirements whose values follow from the robot and from the setting with the same name.
+# Fields of ``Requirements`` that are computed from the robot and from the setting with the same name.
 _WORKED_OUT = {"contact_pose", "base", "hold", "com_margin", "limit_margin"}
 
 
@@ -225,7 +225,7 @@ def _resolved_contacts(impact: ResolvedImpact) -> dict[str, object]:
 
 
 def _resolved_variants(variants: Sequence[ModelVariant]) -> dict[str, object]:
-    """Return the settings from which these model variants result."""
+    """Return the settings ``armature_range`` and ``payload`` that define these model variants."""
     # The nominal robot is always one of the variants.
     factors = {variant.armature_factor for variant in variants} - {1.0}
     if len(factors) == 1:

@@ -1,4 +1,4 @@
-"""Make a problem well-posed: fix free motions, omit redundant rows, block turns that exist only to first order."""
+"""Make a problem well-posed: fix free motions, omit redundant rows, block turns possible only to first order."""
 
 from __future__ import annotations
 

@@ -30,8 +30,8 @@ class Distribution:
         shares: Signed share of each actuator (:class:`Equilibrium`), shape (actuators,).
         unbalanced: Sum of the absolute entries of the unbalanced wrench on the base; zero if the base is balanced.
             Forces are in units of the robot's weight, moments in units of the weight times 1 m.
-        jacobian: Tangent Jacobian of ``unbalanced`` and the absolute shares, shape (1 + actuators, nv).  With unknown
-            forces, only the rows of the largest shares are nonzero, or the row of ``unbalanced`` if the base is not
+        jacobian: Tangent Jacobian of ``unbalanced`` and the absolute shares, shape (1 + actuators, nv).  If ``z`` has
+            entries, only the rows of the largest shares are nonzero, or the row of ``unbalanced`` if the base is not
             balanced.
     """
 
@@ -198,7 +198,7 @@ class Equilibrium:
         """
         rate = self.rows @ dynamic
         if not self.load.count and not self.balanced:
-            # A linear program is not needed, because no forces are unknown.
+            # A linear program is not needed, because ``z`` has no entries.
             shares, moving = self.rows @ rest + self.offset, rate != 0
             most = ((1 - np.sign(rate) * shares)[moving] / np.abs(rate[moving])).min(initial=np.inf)
             return None if np.abs(shares).max(initial=0.0) > 1 else float(most)

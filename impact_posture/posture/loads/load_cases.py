@@ -28,8 +28,8 @@ _EDGES = 4
 # Upper limit of the friction coefficient.  With a larger coefficient, the edges of the friction pyramid would be
 # nearly horizontal and could hardly support weight.
 _MOST_FRICTION = 10.0
-# Singular values of the map from rotor thrusts and foot forces to the base wrench are zero below this fraction of
-# the largest one.
+# Singular values of the map from rotor thrusts and foot forces to the base wrench count as zero below this fraction
+# of the largest singular value.
 _RANK = 1e-9
 
 

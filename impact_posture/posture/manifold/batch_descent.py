@@ -91,7 +91,7 @@ class _Points(_Rows):
 
 @dataclass
 class _State(_Points):
-    """Descents under way: one row for each.
+    """Descents that have not ended, one row for each.
 
     Attributes:
         direction: Direction of the next step, shape (N, nv).
@@ -114,7 +114,7 @@ class BatchDescent:
     """Descents on a manifold.  :meth:`add` begins descents, :meth:`step` continues all.
 
     Attributes:
-        stuck: Tags of the descents that ended off the equalities, shape (K,).
+        stuck: Tags of the descents that ended at postures that violate the equalities, shape (K,).
     """
 
     def __init__(self, manifold: ConstraintManifold) -> None:
@@ -123,7 +123,7 @@ class BatchDescent:
 
     @property
     def active(self) -> int:
-        """Number of descents under way."""
+        """Number of descents that have not ended."""
         return len(self._state.x)
 
     def add(self, x: Array, tag: NDArray[np.int_]) -> None:
@@ -134,7 +134,7 @@ class BatchDescent:
         self._state = self._state.joined(begun)
 
     def step(self) -> Ends:
-        """Take a step in each descent, and return the descents that ended on the equalities."""
+        """Take a step in each descent, and return the descents that ended at postures that satisfy the equalities."""
         s, manifold = self._state, self.manifold
         s.age += 1
         size = np.linalg.norm(s.direction, axis=1)

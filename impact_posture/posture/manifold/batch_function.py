@@ -15,9 +15,9 @@ import numpy as np
 
 from impact_posture.system.arrays import Array
 
-# Number of postures in a run of the operations.  With fewer postures, the calls of NumPy take most of the time.
+# Number of postures that are evaluated together.  With fewer postures, the calls of NumPy take most of the time.
 _WIDTH = 512
-# CasADi evaluates smaller batches in less time.
+# Below this number of postures, CasADi is faster.
 _SMALL = 64
 
 

@@ -95,7 +95,7 @@ class ConstraintManifold:
         self._turning = np.zeros(self.chart.nx, dtype=bool)
         self.lower, self.upper = problem.lower.copy(), problem.upper.copy()
         for slot in self.chart.slots:
-            # A full turn of a coupled joint moves its partners.
+            # Coupled joints keep their limits, because a full turn would move the joints coupled to them.
             if slot.kind.family in ("revolute", "continuous") and slot.name not in problem.robot.coupled_joints:
                 k = slot.x.start
                 self._turning[k] = self.upper[k] - self.lower[k] >= 2 * np.pi

@@ -149,7 +149,7 @@ class StartDraw:
 
     Odd starts lie near the posture ``around``, by default the given posture.  Even starts lie anywhere within the
     limits.  Near starts reach the constraints more often; far starts lead to other optima.  ``projector`` may belong
-    to the same problem with fewer parts in its program.
+    to the same problem with fewer rows in its program.
     """
 
     def __init__(

@@ -155,7 +155,7 @@ def _with_sides(rows: Derivatives, sides: list[Derivatives], nx: int) -> Derivat
 
 
 def _stacked(parts: list[Derivatives], nx: int) -> tuple[ca.SX, ca.SX]:
-    """Return the joint Jacobian and Hessian of parts that share the unknowns x but no auxiliary unknowns."""
+    """Return the Jacobian and Hessian of all parts together; they share the unknowns x but no auxiliary unknowns."""
     J = ca.horzcat(ca.vertcat(*[p.jacobian[:, :nx] for p in parts]), ca.diagcat(*[p.jacobian[:, nx:] for p in parts]))
     both = ca.horzcat(*[p.hessian[:nx, nx:] for p in parts])
     H = ca.vertcat(
@@ -166,5 +166,5 @@ def _stacked(parts: list[Derivatives], nx: int) -> tuple[ca.SX, ca.SX]:
 
 
 def joined(first: Derivatives, second: Derivatives, nx: int) -> Derivatives:
-    """Join the derivatives of two sets of rows that share the unknowns x but no auxiliary unknowns."""
+    """Join the derivatives of two sets of rows; the sets share the unknowns x but no auxiliary unknowns."""
     return Derivatives(ca.vertcat(first.multipliers, second.multipliers), *_stacked([first, second], nx))

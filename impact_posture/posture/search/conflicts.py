@@ -1,4 +1,4 @@
-"""Find the conflicting constraints of an infeasible problem, by relaxing each constraint with priced slacks."""
+"""Find the conflicting constraints of an infeasible problem, by relaxing each constraint with penalized slacks."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from impact_posture.system.arrays import Array
 
 # A violation below this (m, rad) counts as satisfied.
 _KEPT = 1e-6
-# Price of a meter of slack of bodies, lower than the price 1 of a violated pose.  If a body blocks a pose, the body
-# is therefore reported as the conflict, not the pose.
+# Penalty per meter of penetration between bodies, lower than the penalty 1 per meter of a violated pose.  If a body
+# blocks a pose, the body is therefore reported as the conflict, not the pose.
 _SLACK_PRICE = 0.03
-# Price of the squared distance from the given posture.  This term makes the solution unique.
+# Weight of the squared distance from the given posture.  This term makes the solution unique.
 _AWAY_PRICE = 1e-6
 # Maximum number of starts.
 _TRIES = 24
@@ -36,18 +36,18 @@ _CONFIRMING = 4
 # Number of random postures that are drawn first. This number usually suffices, and drawing all takes longer than
 # solving the program of a small robot.
 _DRAW = 8
-# Maximum number of times that missing parts are added to the program for one start.
+# Maximum number of times that missing rows are added to the program for one start.
 _ROUNDS = 20
 
 
 @dataclass(frozen=True)
 class LeastViolation:
-    """The posture ``q`` with the least violation, and the problem with all parts that its program needed.
+    """The posture ``q`` with the least violation, and the problem with all rows that its program needed.
 
     ``conflicts`` is the violation of each violated constraint; it is empty if all constraints are satisfied.
     ``sizes`` contains the violations as texts with units.
     ``at_limits`` names the joints that are at a limit.  ``violation`` is the sum of all violations, each multiplied
-    by the price of its constraint.
+    by the penalty (:attr:`Constraint.price`) of its constraint.
     """
 
     q: Array
@@ -67,9 +67,9 @@ def find_conflicts(
 ) -> LeastViolation:
     """Minimize the slack ``Σ (s⁺ + s⁻)`` with ``c(q) + s⁺ − s⁻`` within bounds, from ``guesses`` and other starts.
 
-    ``program`` may belong to the same problem with another target or with fewer parts.
-    ``beside`` is the least violation known from a nearby target.  If the first few starts reduce the violation below
-    half of ``beside``, the other starts run too; otherwise the search stops.
+    ``program`` may belong to the same problem with another target or with fewer rows.  ``beside`` is the least
+    violation known from a nearby target.  If the first few starts reduce the violation below half of ``beside``, the
+    other starts run too; otherwise the search stops.
     """
     chart = Chart.of(problem.robot.model)
     program = program or ElasticProgram(problem)
@@ -99,7 +99,7 @@ def _starts(problem: ConstrainedProblem, chart: Chart, seed: int) -> Iterator[Ar
 
 
 def _relax(problem: ConstrainedProblem, chart: Chart, program: ElasticProgram, start: Array) -> LeastViolation:
-    """Minimize the slack from one start; the problem in the result contains parts that the program lacked."""
+    """Minimize the slack from one start; the problem in the result contains the rows that the program lacked."""
     lower_rows, upper_rows = problem.row_bounds
     norms = np.zeros(len(chart.quaternion_slices()))
     x = np.clip(chart.to_x(start), problem.lower, problem.upper)
@@ -123,9 +123,9 @@ def _relax(problem: ConstrainedProblem, chart: Chart, program: ElasticProgram, s
 class ElasticProgram:
     """The program that relaxes the constraints with slacks.
 
-    Most expressions of the program stay the same when parts are added to the problem.  ``rows`` are the rows of its
-    constraints, if another program of the problem has already built them.  ``problem`` is the problem with all parts
-    added so far, and ``time_s`` the total wall time of the solver.
+    Most expressions of the program stay the same when rows are added.  ``rows`` are the rows of its constraints, if
+    another program of the problem has already built them.  ``problem`` is the problem with all rows added so far, and
+    ``time_s`` is the total wall time of the solver.
     """
 
     def __init__(self, problem: ConstrainedProblem, rows: ProgramRows | None = None) -> None:
@@ -136,7 +136,7 @@ class ElasticProgram:
         self._fixed = Derivatives.of(ca.vertcat(self._away, rows.norms), rows.x)
 
     def solver(self, problem: ConstrainedProblem) -> ca.Function:
-        """Return ``nlpsol`` for the first problem, also with another target or with additional parts."""
+        """Return ``nlpsol`` for the first problem, or for this problem with another target or additional rows."""
         self.problem, structure = problem, problem.structure
         if self._latest is None or self._latest[0] != structure:
             self._latest = structure, self._solver(problem)
@@ -145,7 +145,7 @@ class ElasticProgram:
     def _solver(self, problem: ConstrainedProblem) -> ca.Function:
         lifted = self._rows.lift(problem)
         z, nx = lifted.variables.numel(), self._rows.chart.nx
-        # If a constraint has its own slack, which has a lower price, its rows need no other slack.
+        # If a constraint has its own slack, which has a lower penalty, its rows need no other slack.
         counts = [len(problem.carried(i)) for i in range(len(problem.constraints))]
         rigid = np.repeat(np.array([not piece.slack.nnz() for piece in lifted.pieces], dtype=bool), counts)
         price = np.repeat([c.price for c in problem.constraints], counts)[rigid]

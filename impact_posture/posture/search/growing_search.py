@@ -1,4 +1,4 @@
-"""Runs of the solver from all starts; parts that a final posture needs are added to the program."""
+"""Runs of the solver from all starts; rows that a final posture violates are added to the program."""
 
 from __future__ import annotations
 
@@ -25,32 +25,32 @@ from impact_posture.system.processes import fork_map
 
 Progress = Callable[[int, int], None]
 
-# Number of starts that run before all others, if parts can be added to the program.
+# Number of starts that run before all others, if rows can be added to the program.
 FIRST = 2
-# Maximum number of runs from one start; before each further run, missing parts are added to the program.
+# Maximum number of runs from one start; before each further run, missing rows are added to the program.
 _ROUNDS = 10
 # If all starts together have at most this number of unknowns, every start is finished, because stopping starts would
 # save no time.
 _SMALL = 1000
-# Largest number of unknowns of all starts that continue together.  With more starts, the program would get parts
-# that the best starts do not need.
+# Largest number of unknowns of all starts that continue together.  With more starts, the program would get rows that
+# the best starts do not need.
 _BATCH = 600
 # Least number of starts that continue together.  With fewer starts, the program would be built more often.
 _LEAST = 2
-# A start is dominated, and stops, if its objective exceeds the best objective by this share.  The share is large
-# because a run after a trap may end below the bound of its start.
+# A start is dominated, and stops, if its objective exceeds the best objective by this fraction.  The fraction is
+# large because the repetition of a trapped run (:attr:`SolverRun.trapped`) may end at a lower objective.
 _FAR = 0.05
-# Starting processes takes as long as runs with this number of unknowns in total.
+# Runs with fewer unknowns in total share this process, because starting other processes would take longer.
 _FORK = 200
 # Starts that continue from postures this close (rad, m) share one run, because their runs would end at the same
 # posture.
 _SAME = 1e-6
-# Price of a meter of slack after a trap.
+# Penalty per meter of slack when a trapped run (:attr:`SolverRun.trapped`) is repeated.
 HIGH_PRICE = 20 * SLACK_PRICE
 # Maximum number of repetitions of a trapped run.
 _ANEW = 4
-# Factor by which each repetition raises the price.  With a fixed price, slack remains if the objective decreases
-# steeply, for example near a stretched ur10.
+# Factor by which each further repetition raises the penalty.  With a fixed penalty, slack remains if the objective
+# decreases steeply, for example near a stretched ur10.
 _DEARER = 10
 
 
@@ -63,12 +63,12 @@ class SolverRun:
         record: Result of the solver; ``None`` if the objective is not defined at the final posture.
         objective: Objective at the final posture.
         minimized: Objective divided by the initial objective, plus the regularization.
-        certificate: Certificate of the final posture; ``None`` while the program lacks parts.
-        lacks: Whether the program lacks parts that the final posture needs.
+        certificate: Certificate of the final posture; ``None`` while the program lacks rows.
+        lacks: Whether the final posture violates rows that the program lacks.
         dominated: Whether the start was stopped after this run because it could not become the best.
-        trapped: Whether the final posture violates a constraint that more parts cannot repair.  Either no parts are
-            missing, or slack lowers the objective by more than its price.  A trapped run is repeated at a higher
-            price of slack.
+        trapped: Whether the final posture violates a constraint although more rows would not help.  Either no rows
+            are missing, or slack lowers the objective by more than the penalty.  A trapped run is repeated with a
+            higher penalty on slack.
         time_s: Wall time of all runs from the start, s; the time of a run for several starts is divided equally among
             them.
     """
@@ -95,8 +95,8 @@ def run_start(
 ) -> tuple[SolveRecord, Certificate]:
     """Solve from a feasible start and certify the result; if that fails, try the other guesses of the objective.
 
-    ``scale`` is the initial objective, ``price`` the price of a meter of slack, and ``first`` the result of the first
-    guess, if the caller has already computed it.
+    ``scale`` is the initial objective, ``price`` the penalty per meter of slack, and ``first`` the result of the
+    first guess, if the caller has already computed this result.
     """
     record = first or nlp.solve(start, scale=scale, price=price)
     certificate = certify(nlp.problem, record.q, scale, record.auxiliaries, nlp.program.numeric)
@@ -111,10 +111,10 @@ def run_start(
 
 
 class GrowingSearch:
-    """Runs from all starts; parts are added to the program, and runs repeated, until no part is missing.
+    """Runs from all starts; rows are added to the program, and runs repeated, until no row is missing.
 
-    ``scale`` is the initial objective.  ``finish_all`` also finishes starts that cannot become the best; small
-    programs always finish them.  ``rows`` may be shared with another program of the same problem.
+    ``scale`` is the initial objective.  ``finish_all`` also finishes starts that cannot become the best; in small
+    programs, such starts are always finished.  ``rows`` may be shared with another program of the same problem.
     """
 
     def __init__(
@@ -134,9 +134,9 @@ class GrowingSearch:
         self.build_time_s = self.nlp.build_time_s
         # Final postures of runs; the next runs continue from these postures with the extended program.
         self._ends: dict[int, Array] = {}
-        # Price of a meter of slack for starts whose runs have not ended in a trap.
+        # Penalty per meter of slack for starts without a trapped run.
         self._price = SLACK_PRICE
-        # For each start, the number of runs that ended in a trap (:attr:`SolverRun.trapped`).
+        # Number of trapped runs (:attr:`SolverRun.trapped`) of each start.
         self._trapped: Counter[int] = Counter()
 
     def run(self, jobs: int, progress: Progress | None) -> list[SolverRun]:
@@ -168,11 +168,10 @@ class GrowingSearch:
                     best = run.minimized
             lacking = {k: r for k in batch if (r := runs[k].record) is not None and runs[k].lacks and k not in last}
             # A run with missing rows passes through bodies and may end between them.  With all rows and a higher
-            # price of slack, a run stays within the constraints that its start satisfies.
+            # penalty on slack, a run stays within the constraints that its start satisfies.
             trapped = {k for k in batch if runs[k].trapped and k not in last}
             if len(runs) < starts and trapped == {*range(FIRST)}:
-                # In each of the first starts, a pass through a body lowers the objective by more than the price of
-                # the slack.
+                # In all first starts, penetrating a body lowers the objective by more than the penalty on the slack.
                 self._price = HIGH_PRICE
             self._trapped.update(trapped)
             owed |= {k: (r, self.problem) for k, r in lacking.items()}
@@ -246,7 +245,7 @@ class GrowingSearch:
 
     @one_blas_thread()
     def _run(self, index: int, *, last: bool) -> SolverRun:
-        """Run one start; if the program lacks parts at the result, certify the result in the last round only."""
+        """Run one start; if the program lacks rows at the result, certify the result in the last round only."""
         nlp, scale, problem = self.nlp, self._scale, self.problem
         numeric = nlp.program.numeric
         trapped, start = self._trapped[index], self._ends.get(index)
@@ -269,7 +268,7 @@ class GrowingSearch:
         if problem.requirements.regularization:
             minimized += problem.requirements.regularization * distance(nlp.chart, record.q, problem.given) ** 2
         certified = certificate is not None and certificate.holds()
-        # If slack lowers the objective by more than its price, more rows do not help.
+        # If slack lowers the objective by more than the penalty, more rows do not help.
         pays = record.converged and problem.slack(record.auxiliaries) > FEASIBLE
         anew = record.converged and (pays or not lacks) and not certified and trapped < _ANEW
         anew = anew and not feasible(problem, record.q, numeric)

@@ -30,9 +30,9 @@ _BISECTIONS = 8
 def initial_posture(problem: ConstrainedProblem, seed: int, rows: ProgramRows) -> tuple[ConstrainedProblem, Array]:
     """Return the given posture moved onto the constraints, or else the first random start that reaches them.
 
-    If the start still violates constraints that the projection ignores, the elastic program moves the start.  The
-    returned problem then has all parts that the elastic program needed.  If no posture allows the speed of a strike,
-    the returned problem requires the greatest possible speed instead.
+    If the start still violates constraints that the projection ignores, :class:`ElasticProgram` moves the start.  The
+    returned problem then has all rows that this program needed.  If no posture allows the speed of a strike, the
+    returned problem requires the greatest possible speed instead.
 
     Raises:
         Infeasible: No posture satisfies the constraints; the error names the conflicting constraints.
@@ -69,8 +69,8 @@ def initial_posture(problem: ConstrainedProblem, seed: int, rows: ProgramRows) -
 def _slowed(least: LeastViolation, seed: int, program: ElasticProgram) -> LeastViolation:
     """Return a posture without conflicts at the greatest approach speed, or ``least`` if the speed is not the reason.
 
-    If other constraints conflict with the speed, as clearances do, their prices hide the greatest speed, so it is
-    searched by bisection.
+    If other constraints, such as clearances, conflict with the speed, the penalties do not show the greatest speed.
+    Bisection then finds this speed.
     """
     (approach,) = [c for c in least.problem.constraints if isinstance(c, ApproachSpeed)] or (None,)
     if approach is None or not least.conflicts:

@@ -3,9 +3,9 @@
 The objective at a posture hardly predicts the optimum to which a descent leads, so each posture descends first
 (:mod:`impact_posture.posture.manifold.batch_descent`).  A hop takes the posture where a good descent ended, gives
 other values to some joints, and descends again (D. J. Wales and J. P. K. Doye, "Global optimization by
-basin-hopping", J. Phys. Chem. A 1997), because many optima differ in a few joints only.  Hops from the best end alone
-seldom leave it.  The hops that reach a better optimum often start from worse ends.  No limit is a time, so a seed
-determines the result.
+basin-hopping", J. Phys. Chem. A 1997), because many optima differ in a few joints only.  Hops from the best optimum
+alone seldom reach another optimum.  The hops that reach a better optimum often start from worse ends.  No limit is a
+time, so a seed determines the result.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from impact_posture.posture.search.start_draws import StartDraws
 from impact_posture.posture.search.unseen_optima import SAME_VALUE, hits_by_value
 from impact_posture.system.arrays import Array
 
-# Number of descents under way.  New descents begin when a quarter of them has ended.
+# Number of descents that run together.  New descents begin when a quarter of these descents has ended.
 _WIDTH = 512
-# When no more descents may begin, the search does not wait for the slowest descents, at most this share of the
+# When no more descents may begin, the search ends if the descents that still run are at most this fraction of the
 # ended descents.  A small batch takes nearly as long as a large one.
 _SLOWEST = 1 / 16
 # Limit of the number of descents times the fourth power of the degrees of freedom, because descents of large robots
@@ -51,7 +51,8 @@ _RANKED, _TIRED = 0.7, 8
 _REDRAWN = (0.1, 0.2, 0.3, 0.5)
 # Share of the hops that take these values from another optimum.  The other hops draw random values.
 _CROSSED = 0.6
-# Distance (rad, m) below which two ends are the same optimum if their merits differ by less than SAME_VALUE.
+# Distance (rad, m) below which two final postures are the same optimum if their merits differ by less than
+# SAME_VALUE.
 _SAME = 0.05
 # The search stops when this number of random postures and hops from worse ends reached the best merit, and if the
 # next three values allow it.
@@ -61,7 +62,7 @@ _HITS = 12
 _FREE = 5
 # Least number of ended descents.
 _ENDS = 256
-# Share of all ends, the last ones, that must not have lowered the best merit.
+# The search stops only if the last descents, this fraction of all ended descents, did not lower the best merit.
 _IDLE = 0.5
 # Number of starts of IPOPT, half of them at the best ends and half at the most different good ends.  If descents
 # ignored no constraint, a third suffices.

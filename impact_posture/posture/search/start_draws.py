@@ -12,8 +12,8 @@ class StartDraws:
 
     Random starts are drawn as in :func:`impact_posture.posture.manifold.feasible_start.feasible_start`.
 
-    Each start is drawn in the process that runs it.  The constraints on the starts stay the same when parts are added
-    to the problem. There is at least one known start.  Every second random start lies near the first known start,
+    Each start is drawn in the process that runs it.  The constraints on the starts stay the same when rows are added
+    to the program. There is at least one known start.  Every second random start lies near the first known start,
     because the posture of the problem may be far from all postures that satisfy the constraints.
     """
 
@@ -24,12 +24,13 @@ class StartDraws:
     def choose(self, index: int, trapped: int = 0) -> Array | None:
         """Return the start with this index, shape (nq,); ``None`` if no attempt reached the constraints.
 
-        ``trapped`` is the number of runs from this start that ended in a trap.  After the first trap, the start is
-        chosen from more candidates.  If further runs from the start end in a trap, another start is drawn.
+        ``trapped`` is the number of trapped runs (:attr:`SolverRun.trapped`) from this start.  After the first
+        trapped run, the start is chosen from more candidates.  If further runs from the start are trapped, another
+        start is drawn.
         """
         if index < len(self._known) and trapped <= 1:
             return self._known[index]
         other = index + max(trapped - 1, 0) * self.count
         draw = StartDraw(self._problem, other, self._seed, self._known[0], self._projector)
-        # A run from a start between bodies may stay trapped there, so more candidates are drawn after a trap.
+        # A run from a start between bodies may stay there, so more candidates are drawn after a trapped run.
         return draw.choose(ATTEMPTS if trapped else CANDIDATES)
