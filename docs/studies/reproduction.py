@@ -72,7 +72,7 @@ def _parts(main: Reproduction, every: Reproduction) -> Iterator[str]:
     )  # fmt: skip
     yield from ("### What did best at this point", "\n".join(f"- {line}" for line in advice(main, every)))
     yield from ("### Table I of the paper, and ours", f"`q_total_impact`, {shown}.", table_one(main))
-    yield from ("What was fitted to the paper:", fitted(main), _SPREAD, LEGEND)
+    yield from ("Values that were fitted to the paper:", fitted(main), _SPREAD, LEGEND)
     if "solo8-push" in main.scenarios:
         yield from ("### At which K the quadruped reaches the paper's reduction", *gains(main))
     few = f"means over seeds 0 to {every.seeds - 1}" if every.seeds > 1 else "seed 0"

@@ -64,7 +64,7 @@ def compile_and_check(
     """
     manifest, _ = read_manifest(export_dir / f"{prefix}.json")
     real, worst = REALS[manifest["real"]], 0.0
-    # A killed process cannot delete its temporary files.  The folder of the export contains them, so that they are
+    # A killed process cannot delete its temporary files.  They lie in the folder of the export, so that they are
     # deleted together with the export.
     with scratch_folder(export_dir) as folder:
         if keep or (built := _cached_library(export_dir, prefix)) is None:

@@ -25,7 +25,8 @@ class NamedObjective:
         objective: The objective.
         stem: Text with which the C names of the objective begin.
         free: Whether this objective ignores the supports of a standing robot.
-        joint: Whether this objective is for several simultaneous contacts.  ``H`` is not exported for it.
+        joint: Whether this objective is for several simultaneous contacts; ``H`` of such an objective is not
+            exported.
     """
 
     objective: WorstCaseObjective

@@ -14,12 +14,13 @@ from impact_posture.config.cached_values import StoredArray
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 
-# ``_TRIED`` is the number of grid positions per joint.  ``_MOST_JOINTS`` limits the number of joints between two
+# ``_TRIED`` is the number of grid positions per joint.  ``_MOST_JOINTS`` is the largest number of joints between two
 # bodies.
 _TRIED, _MOST_JOINTS = 25, 3
-# Half of the largest range of a joint, rad (m), so that the step of the grid is at most half a radian.
+# Half of the largest joint range for which planes are searched, rad (m).  The step of the grid is then about half a
+# radian.
 _MOST_HALF = 6.5
-# ``_MOST_PLANES`` is the largest number of planes of a pair of bodies.  At free positions, the shapes do not touch;
+# ``_MOST_PLANES`` is the largest number of planes for a pair of bodies.  At free positions, the shapes do not touch;
 # at least the fraction ``_LEFT`` of the free positions must remain.
 _MOST_PLANES, _LEFT = 12, 1 / 3
 # The cost of a plane is the number of removed free positions, plus this fraction of all free positions.

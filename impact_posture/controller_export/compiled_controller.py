@@ -26,7 +26,7 @@ from impact_posture.system.libraries import library_path, load_library
 from impact_posture.tsid.controller import Command, Report
 
 _FUNCTIONS = ("init", "reset", "tick", "last_report", "move_to", "lead_posture", "brace", "contact", "release")
-# C functions of controllers with a reference flow.  Controllers of earlier versions lack them.
+# C functions of controllers with a reference flow.  Controllers of earlier versions lack these functions.
 _OPTIONAL = ("brace_before", "lead")
 # Number of doubles in a target: 1 (whether the target is set), 3 (position), 9 (rotation), 6 (velocity), and 6
 # (acceleration).
@@ -278,7 +278,8 @@ class CompiledController:
 
         Raises:
             InputError: This phase cannot follow the present phase, or ``t`` is before the time of a phase that has
-                not begun yet.  Or ``t_impact`` is not finite, or is given to a controller without a flow.
+                not begun yet.  Another reason is a ``t_impact`` that is not finite, or that the controller cannot use
+                because it has no reference flow.
         """
         if t_impact is None:
             self._enter("brace", t)

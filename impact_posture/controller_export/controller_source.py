@@ -42,7 +42,8 @@ _RELAXATION = (
     "relaxation_memory.c", "vector.c", "relaxation_rows.c", "relaxation_elimination.c", "relaxation_level.c",
     "relaxation_cost.c", "relaxation.c",
 )  # fmt: skip
-# Parameters that ``init`` compares with other parameters.  The C code needs the index of each of them by name.
+# Parameters that ``init`` compares with other parameters.  The C code needs a named index for each of these
+# parameters.
 _NAMED = ("control_upper", "joint_upper", "contact_normal", "law_rate", "posture_weight", "task_weight")
 # Stack bytes of a tick apart from arrays: variables, saved registers and return addresses of all functions.
 _FRAMES = 4096

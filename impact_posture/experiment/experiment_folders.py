@@ -128,7 +128,7 @@ def draw_side_by_side(jobs: Sequence[Job], store: JobStore, folder: Path, format
 
 
 def draw_reproduction(reproduction: Reproduction, store: JobStore, folder: Path, formats: Sequence[str]) -> None:
-    """Draw the figure ``bars``.  For each scenario, draw figures that compare nominal, robust and best controller."""
+    """Draw the figure ``bars`` and, for each scenario, figures that compare nominal, robust and best controller."""
     bars = []
     for row in reproduction.rows:
         paper, total = PAPER.get(row.scenario), row.metrics.get("q_total_impact")

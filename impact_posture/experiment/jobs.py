@@ -26,9 +26,9 @@ from impact_posture.system.optional_package import import_mujoco
 Document = dict[str, Any]
 
 SCHEMA = "impact-posture/simulation/4"
-# Compiling the controller saves time for at least this number of runs.  For a humanoid, compiling takes about 6 s and
-# saves 4 s in each run.  The number is the same if the cache contains the library, because the rounding errors of a
-# run must not depend on earlier runs.
+# Compiling the controller saves time from this number of runs on.  For a humanoid, compiling takes about 6 s and
+# saves 4 s in each run.  A library in the cache does not change this number, because the rounding errors of a run
+# must not depend on earlier runs.
 _PAYS = 2
 
 

@@ -52,8 +52,8 @@ _AERIAL = (
 _PUSHED = "the stiffness of the nominal controller was chosen so that its motion is near the paper's"
 FITTED = {"aerial-vertical": _AERIAL, "aerial-lateral": _AERIAL, "solo8-push": _PUSHED, "talos-push": _PUSHED}
 
-# Scenario → controller that meets its targets in most variations of the scenario (docs/reproduction.md).  If no
-# controller meets the targets, the entry is the controller that misses them least.
+# Scenario → controller that meets its targets in most variations of the scenario (docs/reproduction.md), or else the
+# controller that misses the targets least.
 RECOMMENDED: dict[str, str] = {
     "aerial-vertical": "robust-flow",
     "aerial-lateral": "posture",
@@ -61,10 +61,9 @@ RECOMMENDED: dict[str, str] = {
     "talos-push": "robust-flow",
 }
 
-# Target → function and text.  The function returns true if a row misses the target.  The second argument of the
-# function is the reduction in the paper.  The text says how the row misses the target.  The target ``recovery``
-# rejects controllers that only delay the motion.  Saturation times are multiples of a tick, so a difference below
-# 1e-9 s is a rounding error.
+# Target → function and text.  The function gets a row and the reduction in the paper, and returns true if the row
+# misses the target.  The text says how the row misses the target.  The target ``recovery`` rejects controllers that
+# only delay the motion.  Saturation times are multiples of a tick, so a difference below 1e-9 s is a rounding error.
 _TARGETS: dict[str, tuple[Callable[[ControllerRow, float], bool], str]] = {
     "reduction": (lambda row, paper: _mean(row.reduction) < paper, "less than the paper's reduction"),
     "recovery": (lambda row, _: _mean(row.recovery) <= 0, "no less motion than nominal over the recovery"),

@@ -102,13 +102,13 @@ def summary(results: Reproduction) -> str:
         "\n".join(f"- {line}" for line in advice(results)),
         "## Table I of Afifi et al. 2026, and ours",
         table_one(results),
-        "What was fitted to the paper:",
+        "Values that were fitted to the paper:",
         fitted(results),
         "The paper has other robots, gains, contact models and windows, and prints few of them. Compare reductions, "
         "not values. `q_total_impact` is the integral of ‖ν‖ over fixed windows, which are the same for every "
         "controller. Contacts are summed, and pushes are the mean of both signs.",
         "A seed above zero changes the start, the speed or force, and the friction (`[spread]` in the scenario), and "
-        "the sensor noise. The intervals contain all of them.",
+        "the sensor noise. The intervals contain all these effects.",
         LEGEND,
     ]
     for scenario in results.scenarios:
@@ -131,9 +131,9 @@ def advice(results: Reproduction, others: Reproduction | None = None) -> list[st
         missed = _missed(best)
         line = (
             f"**{markdown(scenario)}**: `{best.controller}` ({MEANING[best.controller.partition(':')[0]]}) moves "
-            f"{reduction_text(best)} less than nominal, over the recovery {percent(best.recovery)}"
+            f"{reduction_text(best)} less than nominal ({percent(best.recovery)} less over the recovery)"
         )
-        line += f", but with {missed}." if missed else ", every target met at this point."
+        line += f", but with {missed}." if missed else " and meets every target."
         line += _force(best, results.row(scenario, "nominal"))
         line += _held(best, (others or results).row(scenario, f"{best.controller}:held"))
         if robust is not None and robust is not best and robust.reduction is not None:
@@ -148,7 +148,7 @@ def _force(best: ControllerRow, nominal: ControllerRow | None) -> str:
     if nominal is None:
         return ""
     before, after = (row.metrics["peak_force"].mean for row in (nominal, best))
-    return f" The contact bears up to {after:.0f} N instead of {before:.0f} N." if after > 1.1 * before else ""
+    return f" The peak contact force is {after:.0f} N instead of {before:.0f} N." if after > 1.1 * before else ""
 
 
 def _held(best: ControllerRow, held: ControllerRow | None) -> str:
@@ -157,7 +157,8 @@ def _held(best: ControllerRow, held: ControllerRow | None) -> str:
     if share is None or share > 0.5:
         return ""
     return (
-        f" This is not due to its posture. Held before the impact, the posture gives {reduction_text(held)}. "
+        " The posture does not cause this reduction: with the posture held before the impact, the reduction is only "
+        f"{reduction_text(held)}. "
         "A stiffer nominal controller is the simpler way."
     )
 
@@ -179,16 +180,16 @@ def remarks(results: Reproduction, scenario: str) -> list[str]:
         held, whole = results.row(scenario, f"{name}:held"), results.row(scenario, name)
         share = _share(held, whole)
         if share is not None:
-            why = "posture" if share > 0.5 else "the stiffness of the term, not the posture"
+            why = "the posture" if share > 0.5 else "the stiffness of the term, not from the posture"
             lines.append(
-                f"`{name}`: with the reached posture held before the impact, {reduction_text(held)} remain of "
-                f"{reduction_text(whole)}. Most of it is {why}."
+                f"`{name}`: if the reached posture is held before the impact, the reduction is "
+                f"{reduction_text(held)} instead of {reduction_text(whole)}. Most of the reduction comes from {why}."
             )
     live, stiff = results.row(scenario, "robust"), results.row(scenario, "stiff")
     if stiff is not None and live is not None and stiff.reduction is not None and live.reduction is not None:
-        more = "more" if stiff.reduction.mean > live.reduction.mean else "less"
+        more = "larger" if stiff.reduction.mean > live.reduction.mean else "smaller"
         lines.append(
-            f"`stiff`, a nominal controller as stiff as the term, gives {reduction_text(stiff)}, which is {more}."
+            f"`stiff`, a nominal controller as stiff as the term, gives a {more} reduction, {reduction_text(stiff)}."
         )
     for row in results.of(scenario):
         if not row.rested:

@@ -17,36 +17,40 @@ from impact_posture.system.folder_record import typed_command
 
 # Metrics in the table of a report: key, unit and meaning.
 _METRICS = (
-    ("q_total_impact", "m, rad", "way of the robot in the impact windows, ∫‖ν‖dt"),
-    ("q_total_recovery", "m, rad", f"the same {UNTIL_RECOVERY}"),
+    ("q_total_impact", "m, rad", "motion of the robot in the impact windows, ∫‖ν‖dt"),
+    ("q_total_recovery", "m, rad", f"as q_total_impact, {UNTIL_RECOVERY}"),
     ("peak_jump", "m/s, rad/s", f"largest ‖ν − ν⁻‖ within {AFTER_TOUCH}, mean of the contacts"),
-    ("peak_jump_max", "m/s, rad/s", "the largest of the contacts"),
+    ("peak_jump_max", "m/s, rad/s", "as peak_jump, but the largest of all contacts"),
     ("peak_recovery", "m/s, rad/s", f"as peak_jump, {UNTIL_RECOVERY}"),
     ("peak_force", "N", "largest normal force in the impact windows"),
-    ("slip", "m", "way that the contact slid in the impact windows"),
+    ("slip", "m", "distance that the contact slid in the impact windows"),
 )
 # Effects on base, joints and contact just after the robot touches the surface: key, unit and meaning.
 _LOADS = (
     ("base_linear", "m/s", "largest change of the base's linear velocity, mean of the contacts"),
-    ("base_angular", "rad/s", "the same of its angular velocity"),
-    ("joint_velocity", "", "largest change of velocity of the worst joint: the largest share of its limit"),
-    ("joint_share", "", "the same, as a share of its velocity limit"),
+    ("base_angular", "rad/s", "largest change of the base's angular velocity, mean of the contacts"),
+    (
+        "joint_velocity",
+        "",
+        "largest change of velocity of the worst joint, which has the largest share of its velocity limit",
+    ),
+    ("joint_share", "", "joint_velocity, as a share of the joint's velocity limit"),
     ("impulse", "N·s", "impulse of the contact along the normal, mean of the contacts"),
 )
 # Metrics with another meaning in push scenarios: key → meaning.
 _PUSH_MEANINGS = {
     "peak_jump": "largest ‖ν‖ from a push on until its window ends, mean of the pushes",
-    "peak_jump_max": "the largest of the pushes",
+    "peak_jump_max": "as peak_jump, but the largest of all pushes",
     "peak_recovery": f"as peak_jump, {UNTIL_RECOVERY.replace('impact', 'push')}",
     "peak_force": "the push",
-    "slip": "way that the fastest foot slid in the impact windows",
+    "slip": "distance that the fastest foot slid in the impact windows",
 }
 # Time between two ticks that a report shows, s: ``FINE`` within impact windows, ``COARSE`` outside impact windows.
 FINE, COARSE = 0.001, 0.025
 _MOVES = (
-    f"The slider goes through time: every {1e3 * FINE:g} ms within the impact windows, every {1e3 * COARSE:g} ms "
-    "elsewhere. Within a window, the orange arrows show the change of velocity since it began. H, V, S and the "
-    "ellipsoid are values of the rigid model at the state of the robot."
+    f"The slider selects the time: every {1e3 * FINE:g} ms within the impact windows, every {1e3 * COARSE:g} ms "
+    "elsewhere. Within a window, the orange arrows show the change of velocity since the window began. H, V, S and "
+    "the ellipsoid are values of the rigid model at the state of the robot."
 )
 
 

@@ -58,10 +58,10 @@ class CaseSolver:
         return repr((self.robot.data_sha256, prepared.impact.q.tolist(), weights, bodies))
 
     def normal_and_speed(self, values: Mapping[str, Any]) -> tuple[Any, float]:
-        """Return normal and speed for ``values`` of the grid axes; with the target, they determine the problem."""
+        """Return normal and speed for ``values`` of the grid axes; normal, speed and target determine the problem."""
         settings = self._case.settings
-        # A speed of the problem can select the objective and require the approach speed.  A speed of the grid must do
-        # neither.
+        # A speed in the problem can select the objective and add a constraint on the approach speed.  A speed of the
+        # grid must have neither effect.
         speed = Unstated(values["speed"]) if "speed" in values else settings.speed
         return values.get("normal", settings.normal), speed
 
@@ -69,7 +69,7 @@ class CaseSolver:
         """Return the problem for a normal and a speed.  :meth:`target` later replaces the target of this problem."""
         settings = replace(self._case.settings, normal=normal, speed=speed)
         prepared = prepare(settings, resolve(settings, self._loaded))
-        # Most problems do not depend on the speed.  Then all speeds use the same problem object and its solutions.
+        # If the problem does not depend on the speed, all speeds use the same problem object and its solutions.
         objective = prepared.impact.objective
         key = objective.structure, tuple(objective.parameters), prepared.problem.requirements
         return replace(kept(self._known, key, lambda: prepared, self._templates), impact=prepared.impact)

@@ -14,8 +14,8 @@ from typing import Any
 from impact_posture.errors import InputError
 from impact_posture.system.optional_package import import_extra
 
-# A Dask scheduler must answer within ``_LONGEST_SILENCE`` (s).  A client that leaves tries for ``_LEAVING`` (s) to
-# tell the scheduler.
+# A Dask scheduler must answer within ``_LONGEST_SILENCE`` (s).  A client that disconnects tries for ``_LEAVING`` (s)
+# to inform the scheduler.
 _LONGEST_SILENCE, _LEAVING = 30, 5
 
 

@@ -32,7 +32,8 @@ from impact_posture.system.output_folder import added_files
 
 # Two neighboring points count as different optima if the difference of their postures exceeds SWITCH and this
 # multiple of the lower quartile of all differences.  The lower quartile estimates the difference between neighbors
-# with the same optimum.  A difference is a norm in the tangent space, without the position of the base.
+# with the same optimum.  The difference of two postures is a norm in the tangent space, without the position of the
+# base.
 _UNUSUAL = 4.0
 # The color scale is logarithmic if the ratio of the largest to the smallest objective exceeds this value.
 _WIDE = 20.0

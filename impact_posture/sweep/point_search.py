@@ -126,7 +126,7 @@ def search(walk: Walk, place: Place, guesses: Sequence[Start], beside: float = 0
 
 
 def improve(walk: Walk, place: Place, known: PointResult, guess: Start) -> PointResult:
-    """Solve a point from the posture of a neighbor.  Return the better of this result and the known result."""
+    """Solve a point from the posture of a neighbor; return the known result if the new result is not better."""
     # The base of a floating robot moves with the target, so the position of the base does not distinguish optima.
     first = 3 if walk.problem.robot.floating else 0
     if known.q is not None and np.abs(known.q - guess.q)[first:].max() < SWITCH:

@@ -171,7 +171,8 @@ class _Shard:
 
     def _share(self) -> None:
         """Copy the result of a point to the next points if they have the same problem."""
-        # Copy from the first of the points with the same problem, because it was started from the most neighbors.
+        # Copy from the first point with the same problem, because this point was solved from the largest number of
+        # neighbors.
         for point, is_new in self._problems():
             if not is_new:
                 index = point - self._points.start

@@ -19,7 +19,7 @@ Progress = Callable[[int, int], None]
 # Maximum number of shards that are submitted and not yet written.  A larger number takes more memory.  With a smaller
 # number, workers may have to wait for the next shard.
 IN_HAND = 64
-# Time after which an executor is checked if no shard was finished, s.
+# If no shard finishes within this time, s, the executor is checked.
 _PAUSE = 5.0
 # Packages whose errors mean that an executor lost its workers.
 _EXECUTORS = ("distributed", "mpi4py", "submitit")

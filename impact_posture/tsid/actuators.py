@@ -38,7 +38,7 @@ class Actuators:
         held = robot.fixed_with(robot.held)
         for c in robot.couplings:
             if c.follower not in held:
-                fault = f"the controller drives each joint by itself, but '{c.follower}' follows '{c.leader}'"
+                fault = f"the controller drives every joint separately, but '{c.follower}' is coupled to '{c.leader}'"
                 hint = "`lock` both, or list them in robot.toml [constraints] hold"
                 raise InputError(fault, where=robot.name, hint=hint)
         propulsion = robot.spec.propulsion

@@ -25,11 +25,13 @@ from impact_posture.tsid.task_formulation import TaskFormulation
 from impact_posture.tsid.tasks.impact_robust import ImpactRobustPosture
 from impact_posture.tsid.tasks.task import Task
 
-# Largest time step of ramps, in periods of the controller.  Without it, a tick after a long pause would end a ramp.
+# Largest time step of ramps, in periods of the controller.  Without this bound, a tick after a long pause would end a
+# ramp.
 _LONGEST = 10
 # Least nv for which LAPACK factorizes the cost (:class:`WhitenedSolver`).  For smaller robots, this saves no time.
 _LARGE = 20
-# A measured vector is invalid if the sum of its squared entries exceeds this value.  Its root is 1e8 m, rad/s or N.
+# A measured vector is invalid if the sum of its squared entries exceeds this value.  The square root of this value is
+# 1e8 (m, rad/s or N).
 _ABSURD = 1e16
 # Largest violation of a control limit, relative to the largest limit.
 _EXCESS = 1e-6

@@ -25,7 +25,7 @@ from impact_posture.system.scratch_folder import scratch_folder
 # step is half as long as the previous step.
 _FIRST_STEP, _LEVELS = 0.02, 7
 # The scale of the relative errors of H, G and ∇H is at least this share of the largest H or G over all normals.
-# Without it, the scale would be zero if the contact cannot move along n.
+# Without this lower bound, the scale would be zero if the contact cannot move along n.
 _FLOOR = 1e-3
 
 

@@ -153,7 +153,7 @@ def test_the_best_row_meets_the_targets_or_else_moves_least() -> None:
 def test_the_summary_begins_with_advice_and_names_faults() -> None:
     results = Reproduction(4, tuple(rows()))
     lines = advice(results)
-    assert len(lines) == 1 and "`posture`" in lines[0] and "every target met at this point." in lines[0]
+    assert len(lines) == 1 and "`posture`" in lines[0] and "meets every target." in lines[0]
     assert "a higher peak jump than nominal" in lines[0]
     text = summary(results)
     assert text.index("What to choose") < text.index("Table I")
@@ -172,7 +172,7 @@ def test_the_summary_of_one_seed_has_no_intervals() -> None:
 
 
 def test_the_held_posture_separates_stiffness_from_posture() -> None:
-    for held, word in ((1.9, "stiffness"), (0.6, "Most of it is posture")):
+    for held, word in ((1.9, "stiffness"), (0.6, "Most of the reduction comes from the posture")):
         parts = [
             *NOMINAL,
             *[document("robust", k, 0.5) for k in range(4)],

@@ -39,7 +39,7 @@ static void ip_list_gave_way(ip_context *c, const double *lower, const double *u
   }
 }
 
-/* Compute the relaxed answer z.  Return whether there is an answer. */
+/* Compute the relaxed answer z.  Return whether the relaxation gave an answer. */
 static int ip_relax(ip_context *c)
 {
   enum { N = IP_VARIABLES, M = IP_OTHERS };

@@ -1,8 +1,8 @@
 /* Limits of the reference flow: distances from the limits, and changes of the flow that do not cross them.  The
  * formulas are in impact_posture/tsid/flow/flow_direction.py. */
 
-/* The flow may move along a limit that it violates by less than this.  With the value of IP_NEAR, the flow would slowly
- * cross the limit. */
+/* The flow may move along a limit that it violates by less than this.  If this value equaled IP_NEAR, the flow would
+ * slowly cross the limit. */
 #define IP_SPENT 9.9e-4
 /* Distance that the flow keeps from joint limits, rad (m), and from limits of static controls, as a share. */
 #define IP_AIM 2e-3

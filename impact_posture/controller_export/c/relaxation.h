@@ -46,12 +46,13 @@ typedef struct {
 } relaxation_report;
 
 /* Return the size of the workspace in bytes.  The workspace must be aligned like a double.  Between calls, the
- * workspace stores the active rows of each level.  Set it to zero before the first call and before an unrelated
- * problem. */
+ * workspace stores the active rows of each level.  Set the workspace to zero before the first call and before an
+ * unrelated problem. */
 size_t relaxation_bytes(int n, int m, int levels);
 
 /* Solve the problem, and return one of the codes above.  Write z (n numbers) if the code is positive.  `budget` is
- * the largest total number of iterations.  If they do not suffice, the next call continues from the active rows. */
+ * the largest total number of iterations.  If the budget does not suffice, the next call continues from the
+ * active rows. */
 int relaxation_solve(const relaxation_problem *problem, void *work, int budget, double *z, relaxation_report *report);
 
 #ifdef __cplusplus

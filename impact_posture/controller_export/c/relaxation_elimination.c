@@ -42,7 +42,7 @@ static void turn_row(const Relaxation *r, double *row) {
 
 static void clear_rows(Relaxation *r) { r->exact = r->near = r->rank = 0; }
 
-/* Add an entry to the exact rows, which reach their goals.  They depend only on the first r->rank reflected
+/* Add an entry to the exact rows, which reach their goals.  Exact rows depend only on the first r->rank reflected
  * coordinates. */
 static void add_exact(Relaxation *r, int entry) {
     const int n = r->n, rank = r->rank, free = n - r->fixed;

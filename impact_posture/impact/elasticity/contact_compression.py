@@ -38,11 +38,11 @@ from impact_posture.system.arrays import Array
 HERTZ_TIME = sqrt(pi) * gamma(7 / 5) / gamma(9 / 10)
 # Radius of the steel tip on the robot, m; a contact given by a material assumes this tip.
 TIP_RADIUS = 0.01
-# Recorded hits of a flat tool lasted 25 ms, so x was 1.7 and not 0.06 (docs: a real robot).
+# Recorded hits of a flat tool lasted 25 ms, which gives x = 1.7; the assumed tip gives x = 0.06 (docs/real-robot.md).
 _TIP_ONLY = f"a flat or padded tool touches longer than the assumed steel tip of {1e3 * TIP_RADIUS:g} mm radius"
 # A joint whose jump is below this fraction of the largest jump of a joint does not determine x.
 _MOVED = 0.1
-# For x up to SHORT, only the links respond.  For x from LONG, the rotors respond too (docs: which inertia).
+# If x ≤ SHORT, only the links respond.  If x ≥ LONG, the rotors respond too (docs/which-inertia.md).
 SHORT, LONG = 0.2, 0.75
 GIVE_ELASTICITY = "add `contact_stiffness` (N/m, or a material) or `contact_duration`"
 """Hint of the errors about an unknown elasticity of the contact."""
@@ -216,11 +216,11 @@ class Compression:
 def compression(
     objective: WorstCaseObjective, q: Array, speed: float, contact: ContactStiffness | None
 ) -> Compression | None:
-    """Return compression time, peak force and x of the impact, with friction, at the leading contact.
+    """Return compression time, peak force and x of the impact, with friction, at the first contact.
 
-    Return ``None`` if all are unknown, or if the contact point cannot move as the friction demands.  ``q`` has shape
-    (nq,), and ``speed`` is the approach speed, m/s.  If ``contact`` is ``None``, x is computed for every material in
-    :data:`MATERIALS`.
+    Return ``None`` if all three are unknown, or if the effective mass is unbounded (:func:`contact_mass`).  ``q`` has
+    shape (nq,), and ``speed`` is the approach speed, m/s.  If ``contact`` is ``None``, x is computed for every
+    material in :data:`MATERIALS`.
     """
     springs, mass = springs_along(objective.case, q), contact_mass(objective.oracle, q)
     if (contact is None and springs is None) or mass is None:

@@ -45,7 +45,7 @@ class CoulombJump(Jump):
 
 
 def coulomb_jump(objective: WorstCaseObjective, q: Array, rebound: float) -> CoulombJump | None:
-    """Return the jump with friction at the leading contact for ``rebound = (1 + e) v_n``, m/s.
+    """Return the jump with friction at the first contact for ``rebound = (1 + e) v_n``, m/s.
 
     Return ``None`` if the point would stick in a posture where S does not exist.
     """

@@ -49,7 +49,7 @@ def classical_ellipsoids(objective: WorstCaseObjective, q: Array) -> dict[str, E
     """Return the ellipsoids ``velocity`` and ``force`` of the contact at ``q``.
 
     The velocity ellipsoid of ``JJᵀ`` contains the contact velocities for ``|ν| ≤ 1`` (Yoshikawa 1985).  Both
-    ellipsoids ignore inertia and supports.  They mix m/s with rad/s, because ``|ν|`` mixes these units.
+    ellipsoids ignore inertia and supports, and mix m/s with rad/s, because ``|ν|`` mixes these units.
     """
     J = objective.oracle.at(q).J
     return {"velocity": ellipsoid_of(J @ J.T), "force": force_ellipsoid(J)}

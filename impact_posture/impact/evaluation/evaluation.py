@@ -88,7 +88,8 @@ class Evaluation(JsonBlock):
         contact_stability: Whether the feet stay on the ground in the impact; ``None`` for a robot without supports.
         standing: The impact if the ground can only push the feet; ``None`` for a robot without supports, or if this
             impact cannot be computed.
-        contacts: Separate evaluation of each contact, the leading contact first; empty if there is only one contact.
+        contacts: Separate evaluation of each contact, in the order of the objective; empty if there is only one
+            contact.
         impulses: Worst impulses of several contacts; ``None`` if there is only one contact.
         model_variants: Objective and scalars for each model variant; empty if there are no variants.
         warnings: Limits of the validity of these quantities, one line each.
@@ -293,7 +294,7 @@ def _warnings(scalars: Scalars, effect: float | None) -> tuple[str, ...]:
         )
     if scalars.S is None:
         lines.append(
-            "S is undefined: the normal has a part along which the contact point cannot move in this posture"
+            "S is undefined: the normal has a component along which the contact point cannot move in this posture"
         )
     if effect is not None and effect > _SOFT:
         lines.append(

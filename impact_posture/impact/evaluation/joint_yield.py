@@ -40,7 +40,7 @@ class JointYield(JsonBlock):
 
 
 def joint_yield(objective: WorstCaseObjective, q: Array) -> JointYield | None:
-    """Return how the joints move the leading contact at ``q``, shape (nq,); ``None`` if no joint moves it."""
+    """Return how the joints move the first contact at ``q``, shape (nq,); ``None`` if no joint moves this contact."""
     robot, oracle = objective.robot, objective.oracle.at(q)
     moving: NDArray[np.bool_] = np.asarray(robot.projector.any(axis=0))
     if robot.floating and not objective.supports:

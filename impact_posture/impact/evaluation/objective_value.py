@@ -22,7 +22,7 @@ class VariantValue:
     Attributes:
         name: Name of the variant.
         objective: Objective for this variant; ``None`` if it does not exist at the posture.
-        scalars: H, G, V, S, E of the leading contact for this variant.
+        scalars: H, G, V, S, E of the first contact for this variant.
     """
 
     name: str

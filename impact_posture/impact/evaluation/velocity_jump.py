@@ -104,7 +104,7 @@ def sticking_jump(objective: WorstCaseObjective, quantities: ImpactQuantities, r
 def weighed_jump(objective: WorstCaseObjective, velocity: Array, impulse: Array) -> Jump:
     """Return a :class:`Jump` from ``velocity``, shape (nv,), at the last posture of the oracle.
 
-    ``impulse`` acts at the leading contact, world axes, shape (3,).
+    ``impulse`` acts at the first contact, world axes, shape (3,).
     """
     norm = float(np.sqrt(max(float(velocity @ objective.oracle.weigh(velocity)), 0.0)))
     along = float(objective.oracle.n @ impulse)

@@ -55,7 +55,7 @@ def contact_impulses(B: Array, before: Array, normals: Array, friction: Array) -
 
 def _admm(B: Array, before: Array, friction: Array, rule: pin.ADMMUpdateRule) -> Array:
     """Return the stacked impulses in axes whose third axis is the normal of the contact."""
-    # The solver reads only the friction of these contacts.  Their model is not used.
+    # The solver reads only the friction of these contacts.  The model ``body`` is required but not used.
     body = pin.Model()
     body.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "body")
     contacts, data = pin.StdVec_ConstraintModel(), pin.StdVec_ConstraintData()

@@ -80,7 +80,7 @@ class ContactStability(JsonBlock):
 
 
 def contact_stability(oracle: ImpactOracle, supports: tuple[Support, ...], q: Array) -> ContactStability:
-    """Compute support impulses within the friction cones at ``q``, shape (nq,); else the impulses of least pull.
+    """Compute support impulses at ``q``, shape (nq,), within the friction cones or, if there are none, of least pull.
 
     The ground is level, so the axis of every cone is world z.  A sole with a ``size`` transmits moments until its
     center of pressure reaches an edge.
@@ -181,7 +181,7 @@ class FrictionCones:
         return None if z is None else particular + basis @ z
 
     def feet(self, impulse: Array, none: float) -> tuple[FootImpulse, ...]:
-        """Return the impulse on each foot.  A foot lifts if its pull is above ``none``."""
+        """Return the impulse on each foot.  A foot lifts if the ground would pull it by more than ``none``."""
         feet = []
         for start, support, _ in self._feet:
             foot_impulse = impulse[start : start + support.rows]

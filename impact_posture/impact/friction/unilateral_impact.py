@@ -59,7 +59,7 @@ class UnilateralImpact:
 class StandingFeet:
     """The contact points of the feet at one posture: their Jacobian, and the forces that carry the weight.
 
-    A sole of known size has its four corners.  Another foot has one contact point.
+    A sole of known size touches the ground at its four corners.  Any other foot has one contact point.
 
     Attributes:
         frames: Frame of the foot for each contact point.

@@ -78,7 +78,7 @@ class StickingPoint:
 def no_sticking() -> MetricError:
     """Build the error for a posture at which S does not exist."""
     return MetricError(
-        "S does not exist here: the normal has a part along which the contact point cannot move",
+        "S does not exist here: the normal has a component along which the contact point cannot move",
         where="objective sticking",
         hint="choose `objective` speed, or another frame, normal or posture",
     )

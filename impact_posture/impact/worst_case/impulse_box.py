@@ -76,7 +76,7 @@ def check_contacts(contacts: Sequence[ImpactContact], kind: type[ImpactKind], *,
     """
     if len(contacts) == 1:
         if bilateral:
-            what = "there is one contact, for which pulling is as bad as pushing"
+            what = "there is only one contact, and a pull causes the same velocity jump as a push"
             raise ContactError(what, where="bilateral", hint="omit `bilateral`")
         return
     if len(contacts) > MOST_CONTACTS:
@@ -86,7 +86,9 @@ def check_contacts(contacts: Sequence[ImpactContact], kind: type[ImpactKind], *,
         if place in places[:i]:
             raise ContactError(f"'{place[0]}' is given twice", where="contact", hint="remove one")
     if not kind.adds_up:
-        what = f"{kind.name} is per approach speed of one contact, which does not determine the impulses of several"
+        what = (
+            f"{kind.name} assumes the approach speed of one contact, which does not determine the impulses of several"
+        )
         raise MetricError(what, where="objective", hint="choose impulse, or give one `contact`")
     if cone:
         what = "the worst case over a cone of normals is exact for one contact only"

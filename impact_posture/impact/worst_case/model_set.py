@@ -49,7 +49,8 @@ class ModelSet:
 
     def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
         tied, gaps = finite_maximum(self.values(q), within)
-        # This objective is ``gap`` below the maximum, so its own subgradients may be ``within − gap`` below it.
+        # This member is ``gap`` below the maximum, so its subgradients may lie ``within − gap`` below the member's
+        # value.
         parts = [self.members[k].subgradients(q, max(within - gap, 0.0)) for k, gap in zip(tied, gaps, strict=True)]
         return Subgradients(
             np.vstack([part.gradients for part in parts]),

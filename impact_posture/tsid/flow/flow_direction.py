@@ -24,8 +24,8 @@ _LEAST = 1e-8
 _LEVEL = 1e-6
 # Largest violation of a limit during braking, rad (m) for joints, and a share of the range for static controls.
 _NEAR = 1e-3
-# The flow may move along a limit that it violates by less than this, in the units of ``_NEAR``.  With the value of
-# ``_NEAR``, the flow would slowly cross the limit.
+# The flow may move along a limit that it violates by less than this, in the units of ``_NEAR``.  If this value
+# equaled ``_NEAR``, the flow would slowly cross the limit.
 _SPENT = 9.9e-4
 # Distance that the flow keeps from the joint limits, rad (m).
 _AIM = 2e-3

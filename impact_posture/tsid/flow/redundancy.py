@@ -14,8 +14,8 @@ from impact_posture.system.arrays import Array
 _SOFT = 2e-2
 # Stiffness of the springs relative to ``H₀``, 1/m²: the energy at an error of 6 mm is about half of ``H₀``.
 _STIFFNESS = 3e4
-# This value is added to the diagonal of the equations of ``back``.  Without it, the equations would be singular if
-# the base can move while the joints are at rest.
+# This value is added to the diagonal of the equations in :meth:`Redundancy.back`, which would otherwise be singular
+# if the base can move while the joints are at rest.
 _IDLE = 1e-9
 
 

@@ -29,8 +29,8 @@ class DaqpSolver:
     def __init__(self, n: int, m: int, *, proximal: float | None = None) -> None:
         """Allocate a workspace for ``n`` variables and ``m`` rows.
 
-        ``proximal`` is the weight of proximal-point iterations.  With ``None``, DAQP decides whether to use them.
-        These iterations take more time, but they also solve a program whose Hessian is nearly singular.
+        ``proximal`` is the weight of proximal-point iterations.  With ``None``, DAQP decides whether to use such
+        iterations.  These iterations take more time, but they also solve a program whose Hessian is nearly singular.
         """
         self._flag = 1
         self._model = daqp.Model()

@@ -22,7 +22,7 @@ class Phase(Enum):
     RELEASE = "release"
 
 
-# Phase → phases that a call of ``enter`` may start next.  RELEASE changes to FREE without a call.
+# Phase → phases that a call of ``enter`` may start next.  RELEASE changes to FREE without a call of ``enter``.
 _FOLLOWS = {
     Phase.FREE: (Phase.BRACE,),
     Phase.BRACE: (Phase.CONTACT, Phase.RELEASE),
