@@ -1,4 +1,4 @@
-"""An aerial manipulator braces for an impact from below: from the nominal posture to the impact-robust posture.
+"""An aerial manipulator braces for an impact from below: it moves from the nominal to the impact-robust posture.
 
 Run: python brace.py EXPORT
 EXPORT: folder that `impact-posture codegen tilthex_arm --frame ee --normal 0 0 1 --out EXPORT` wrote.
@@ -36,4 +36,4 @@ for k in range(4500):
 
 report = controller.report()
 print(f"H after: {export.objective(q)[0]:.1f}; {posture.activation.phase.value}, {command.status.value}")
-print(f"end effector: {1e3 * np.linalg.norm(report.residuals['ee pose']):.1e} mm/s² off what was asked for")
+print(f"end effector: acceleration error {1e3 * np.linalg.norm(report.residuals['ee pose']):.1e} mm/s²")

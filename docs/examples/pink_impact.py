@@ -187,7 +187,7 @@ def report(outcome: Outcome) -> None:
     print(f"  H {H[0]:.6g} → {H[-1]:.6g} ({100 * (H[-1] / H[0] - 1):+.1f} %) in {(len(H) - 1) * DT:.1f} s")
     before, after = (objective.oracle.quantities(q) for q in (outcome.offline.initial, outcome.q))
     print("  beside it", ", ".join(f"{k} {getattr(before, k):.4g} → {getattr(after, k):.4g}" for k in "GVS"))
-    print(f"  what is held was off by {outcome.errors.max():.1e} at most, {outcome.errors[-1]:.1e} at the end")
+    print(f"  error of the kept tasks: {outcome.errors.max():.1e} at most, {outcome.errors[-1]:.1e} at the end")
     if outcome.speed >= AT_REST:
         print(f"  still moving: |v| = {outcome.speed:.1e}")
     distances, optima = outcome.distances(), outcome.offline.optima

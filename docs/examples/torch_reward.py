@@ -51,7 +51,7 @@ class Outcome:
 
 
 def train(weight: float, steps: int = 500, seed: int = 0) -> Outcome:
-    """Train a policy with a weight of the penalty, and return what it does at new targets."""
+    """Train a policy with a weight of the penalty, and return its outcome at new targets."""
     torch.manual_seed(seed)
     robot = ip.load_robot(str(MJCF))
     contact = ip.ImpactContact("tool", normal=(-1, 0, 0), friction=0.0)

@@ -40,7 +40,7 @@ def lines(request: Request) -> Iterator[str]:
     """
     this = str(Path(sys.executable).with_name("impact-posture"))
     programs = {"this": this} | ({"other": request.against} if request.against else {})
-    yield f"{machine()}; medians of {request.count} runs in a terminal, after one that warms the caches."
+    yield f"{machine()}; medians of {request.count} runs in a terminal, after a run that warms the caches."
     yield ""
     head = ("case", "program", "answer s", "target", "end s", "target", "processor s")
     yield from table(head, _rows(request, programs))

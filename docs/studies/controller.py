@@ -71,7 +71,7 @@ def flowing(name: str, ticks: int) -> tuple[Path, list[Vector]]:
 
 
 def times(folder: Path, recorded: list[Vector], flags: list[str], cold: bool) -> tuple[float, float]:
-    """Return median and 99th percentile of the times of ticks, µs.  Each time is the shortest of all repetitions."""
+    """Return the median and the 99th percentile of the tick times, µs, from the shortest time of each tick."""
     least = _least(folder, recorded, flags, [["cold"] if cold else []])[0][:, 0]
     return float(np.median(least)), float(np.percentile(least, 99))
 
@@ -93,7 +93,7 @@ def robust_over_nominal(name: str, frame: str, recorded: list[Vector]) -> list[s
 def _least(folder: Path, recorded: list[Vector], flags: list[str], variants: list[list[str]]) -> list[Vector]:
     """Return the shortest time of each tick and of its gradient, µs, shape (ticks, 2).
 
-    ``variants`` are lists of arguments for ``controller_times.c``.  Each of them gets its own array of times.
+    ``variants`` are lists of arguments for ``controller_times.c``.  Each list gets a separate array of times.
     """
     with tempfile.TemporaryDirectory() as scratch:
         program, data = Path(scratch) / "times", Path(scratch) / "ticks.bin"

@@ -72,7 +72,7 @@ def _build(folder: Path, daqp: Path) -> Path:
 
 
 def times(program: Path, name: str, recorded: list[Vector]) -> tuple[float, float]:
-    """Return median and 99th percentile of the times of ticks, µs.  Each time is the shortest of all repetitions."""
+    """Return the median and the 99th percentile of the tick times, µs, from the shortest time of each tick."""
     robot, formulation = formulation_of(name)
     controller = Controller(robot, formulation)
     controller.reset(robot.posture(), np.zeros(robot.nv))

@@ -63,9 +63,7 @@ STUDIES = {
     study.name: study
     for study in (
         Study("solve", "solve", "solve and build times, and the exported gradient with feet; random starts", 20),
-        Study(
-            "answer", "answer", "optimize until its answer and until its end, beside another program", 5, page=False
-        ),
+        Study("answer", "answer", "time of optimize until answer and end, beside another program", 5, page=False),
         Study("formulations", "formulations", "the linear solve inside the program or its objective", 12, page=False),
         Study("kernel", "kernel.times", "H and ∇H beside Pinocchio C++, ADAM and CasADi; passes", 101),
         Study("gpu", "gpu.study", "H and ∇H on a GPU beside all cores, PyTorch and frax"),
@@ -83,12 +81,12 @@ STUDIES = {
         Study("hits", "hits.study", "recorded hits of an iiwa 7, predicted; resamples", 200, target="study-hits"),
         Study("global", "global_search:maps", "self-motions and their bounds; seeds", 10, target="study-global"),
         Study("search", "search_quality:arms", "the default search and 16 starts; seeds", 3, target="study-global"),
-        Study("search-catalogue", "search_quality:catalogue", "the same for the catalogue; seeds", 3, page=False),
+        Study("search-catalogue", "search_quality:catalogue", "default search, catalogue; seeds", 3, page=False),
         Study("flow", "flow", "where the reference flow rests, from random starts", 1000, target="study-flow"),
-        Study("strikes", "strikes", "planned strikes beside others; seeds", 10, target="study-strikes"),
+        Study("strikes", "strikes", "planned strikes, other controllers; seeds", 10, target="study-strikes"),
         Study("strike-instants", "strikes:instants", "early and late contacts of strikes", target="study-strikes"),
         Study("real-impacts", "real_impacts", "balls, strikes, taps, as predicted", target="study-real-impacts"),
-        Study("points", "robustness.study:points", "runs the points of the next two; random draws", 40, page=False),
+        Study("points", "robustness.study:points", "runs for robustness, envelope; random draws", 40, page=False),
         Study("robustness", "robustness.study", "where each controller helps", target="study-robustness"),
         Study("envelope", "robustness.study:kept_targets", "targets that are kept", target="study-robustness"),
         Study(

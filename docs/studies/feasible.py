@@ -65,8 +65,8 @@ def lines(request: Request) -> Iterator[str]:
     cases = [(robot, name) for robot in known_robots() if request.only in robot for name in _NORMALS]
     yield from table((*_HEAD, "conflict"), (_row(robot, name, request, ends, left) for robot, name in cases))
     yield ""
-    yield f"Certified ends with all demands, from {request.count} seeds: {sum(ends)}.  At {sum(left)} of them,"
-    yield "original shapes touch, and these ends were left out."
+    yield f"Certified solutions, all constraints, from {request.count} seeds: {sum(ends)}.  At {sum(left)} of them,"
+    yield "original shapes touch, and these solutions were left out."
 
 
 def _row(robot: str, name: str, request: Request, ends: list[int], left: list[int]) -> list[str]:

@@ -1,4 +1,4 @@
-"""Every robot model at hand, from its bare file to an optimized posture, each in its own process.
+"""Optimize a posture of every available robot model from its bare file, each model in a separate process.
 
 ``python -m docs.studies.robots SOURCE STARTS SEED`` runs one robot and prints its row as JSON.
 """
@@ -191,7 +191,7 @@ def _start_from(config: Path, name: str, robot: Robot, joints: dict[str, float])
 
 
 def natural_normal(robot: Robot) -> tuple[float, ...]:
-    """Return the normal of the ground for a foot, and of a wall ahead for a base; else against the last link.
+    """Return the normal: up for a foot, backwards for a base (a wall ahead), and else against the last link.
 
     The last link reaches from its joint, or from the next joint that is far enough away, to the contact point.
     """

@@ -113,7 +113,8 @@ def lines(request: Request) -> Iterator[str]:
     answers = collected(lambda k: results(*pairs[k], seeds), len(pairs), request.jobs, "controllers")
     answer_of = dict(zip(pairs, answers, strict=True))
     yield (
-        f"Each number is the median over {len(seeds)} seeds, and in parentheses the worst. Bars: speed within "
+        f"Each number is the median over {len(seeds)} seeds, followed by the worst value in parentheses. Bars "
+        f"(largest allowed errors): speed within "
         f"{SPEED:.0%} of the stated one, instant within {1e3 * INSTANT:g} ms, no saturation before the contact, "
         f"measured jump within {RATIO:.0%} of the predicted one, all runs completed. A seed changes the speed by "
         f"at most {SPREAD.speed:.0%}, tilts the surface by at most {SPREAD.normal:g}°, and shifts it by at most "

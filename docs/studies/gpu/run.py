@@ -65,7 +65,7 @@ def build_cores(case: Case) -> str:
 
 
 def row(first: list[str], answer: str, cells: Callable[[Case], list[str]]) -> list[str]:
-    """Return the row of an answer of :func:`run`: the first cells, then ``cells`` of the answer, or its error."""
+    """Return a table row: the cells ``first``, then the cells of an answer of :func:`run`, or its error."""
     data = json.loads(answer)
     return [*first, *([data["error"]] if "error" in data else cells(data))]
 

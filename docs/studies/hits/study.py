@@ -188,7 +188,7 @@ def _recordings(groups: Groups, left_out: Sequence[str], request: Request) -> It
 
 
 def _with_interval(values: Sequence[float], digits: int) -> str:
-    """Write the first value, and the interval of the others."""
+    """Write the first value, and the 95 % interval of the other values."""
     low, high = np.percentile(values[1:], [2.5, 97.5])
     return f"{values[0]:.{digits}f} ({low:.{digits}f} … {high:.{digits}f})"
 

@@ -151,7 +151,8 @@ def _convex_row(row: Row) -> list[str]:
 
 
 def _variations(dropped: Sequence[Dropped], postures: int) -> Iterator[str]:
-    """Yield a table of impacts with other speeds, restitutions and stiffnesses.  The lightest robot has own rows."""
+    """Yield a table of impacts with other speeds, restitutions and stiffnesses; the lightest robot has its own
+    rows."""
     few = [replace(robot, scenes=robot.scenes[:_FEW]) for robot in dropped]
     body, gone = [], []
     parts = ("", [r for r in few if r.robot != LIGHTEST]), (f", {LIGHTEST}", [r for r in few if r.robot == LIGHTEST])

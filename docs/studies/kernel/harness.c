@@ -18,8 +18,8 @@ static double now(void)
 }
 
 /* Return the seconds for each configuration.  Count calls that do not return zero in *failed.  `kind` is the kind of
- * f: e(val), v(alue), b(atch), or d(ifferences).  For differences, call a value function at each configuration q, and
- * twice for each direction at configurations that were moved by `step` before.
+ * f: e(val), v(alue), b(atch), or d(ifferences).  For differences, q contains each configuration, followed by two
+ * configurations for each direction, moved by +step and -step.
  */
 double time_pass(char kind, void *f, const double *q, const double *n, int nq, int nv, int count, double step,
                  double *H, double *grad, int *failed)

@@ -85,7 +85,7 @@ def choice(name: str, own: Sequence[Record]) -> str:
     others = ", ".join(
         f"`{s.controller}` at {s.kept} (motion {percent(s.motion[1])})" for s in summaries if s is not best
     )
-    return f"{words}. Of the others, every target is kept by {others}."
+    return f"{words}. Of the other controllers, every target is kept by {others}."
 
 
 def _tuned(name: str, own: Sequence[Record]) -> str:

@@ -13,8 +13,8 @@ import numpy as np
 
 from docs.studies.core import Vector
 
-# Tangential creep of a contact that sticks, as a share of its mobility.  It selects the forces of soles whose corners
-# hold more directions than the sole can move in.
+# Tangential creep of a contact that sticks, as a share of its mobility.  It makes the forces unique if the corners of
+# a sole constrain more directions than the sole has degrees of freedom.
 _CREEP = 1e-4
 # Relative error of a solved step.
 _TOLERANCE = 1e-9

@@ -36,8 +36,8 @@ NUMBERS = {
 VELOCITIES = ("linear", "angular", "joint")
 # A change below this value has no sign.
 NO_CHANGE = 0.03
-# Largest relative error of the predicted contact time from which on the feet stay.  Prediction and simulation have
-# this time up to 5 %.
+# Largest relative error of the predicted shortest contact time with which the feet stay.  The simulation determines
+# this time with an accuracy of 5 %.
 HOLDING = 0.20
 # Reasons why a number may be beyond its bar.
 NEGLIGIBLE, MOVES_LONG = "negligible", "robot moves"
@@ -158,7 +158,7 @@ def _feet(rows: Sequence[Row], request: Request) -> Iterator[str]:
 
 
 def _holding(times: Sequence[HoldingTime], request: Request) -> Iterator[str]:
-    """Yield the contact times from which on the feet stay, the worst first."""
+    """Yield the shortest contact times with which the feet stay, the largest error first."""
     if not times:
         return
     ordered = sorted(times, key=lambda time: -abs(np.log(time.predicted / time.simulated)))
@@ -166,13 +166,13 @@ def _holding(times: Sequence[HoldingTime], request: Request) -> Iterator[str]:
     missed = reasons.count("")
     yield from (
         "",
-        f"Contact times from which on the feet stay, within {100 * HOLDING:g} %: {reasons.count(None)} of",
+        f"Shortest contact times with which the feet stay, within {100 * HOLDING:g} %: {reasons.count(None)} of",
     )
     yield f"{len(times)}; robot moves: {reasons.count(MOVES_LONG)}; missed: {missed}. The worst first:"
     yield ""
     yield from table(_HOLDING, [_holding_row(*entry) for entry in zip(ordered, reasons, strict=True)])
     if missed:
-        request.missed.append(f"contact time from which on the feet stay: {missed} of {len(times)}")
+        request.missed.append(f"shortest contact time with which the feet stay: {missed} of {len(times)}")
 
 
 def _holding_reason(time: HoldingTime) -> str | None:

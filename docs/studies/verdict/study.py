@@ -30,7 +30,7 @@ STIFFNESSES = (1e5, 1e6)
 MOVES = 0.01
 # The prediction names the right joint if the simulated share of no other joint is larger by more than this fraction.
 _SAME_JOINT = 0.05
-# Accuracy of the simulated contact time from which on the feet stay.
+# Accuracy of the simulated shortest contact time with which the feet stay.
 _HOLDING = 0.05
 
 
@@ -168,7 +168,7 @@ class Row:
 
 @dataclass(frozen=True)
 class HoldingTime:
-    """The contact time, s, from which on the feet stay in one posture, predicted and simulated, up to 5 % each.
+    """The shortest contact time, s, with which the feet stay in one posture: predicted, and simulated to 5 %.
 
     Attributes:
         still: The simulated time with the mass matrix and the Jacobians of the first posture.
@@ -186,7 +186,7 @@ class HoldingTime:
 
 @dataclass(frozen=True)
 class Compared:
-    """Rows of one case at one friction, contact times from which on its feet stay, and why rows are missing."""
+    """Rows of one case at one friction, shortest contact times with which its feet stay, and why rows are missing."""
 
     rows: tuple[Row, ...]
     held: tuple[HoldingTime, ...]
@@ -223,7 +223,7 @@ def compare(case: Case, friction: float, starts: int) -> Compared:
 
 
 def _holding_time(impact: ResolvedImpact, evaluation: Evaluation, predicted: float, *, still: bool) -> float:
-    """Return the contact time, s, from which on the simulated feet stay, between 2/3 and 3/2 of the prediction."""
+    """Return the shortest contact time, s, with which simulated feet stay, between 2/3 and 3/2 of the prediction."""
     robot, contact = impact.robot, impact.contact
     hit = point_on(robot, contact.frame, contact.offset)
     simulation = ImpactSimulation(
