@@ -49,7 +49,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Run the tests first that fork most often, because a fork takes the longer, the more memory a process uses."""
+    """Begin with the tests that fork most often, because a fork takes longer when a process uses more memory."""
     items.sort(key=lambda item: item.path.parent.name not in ("hostile", "cli", "docs", "experiment"))
 
 

@@ -24,7 +24,7 @@ from impact_posture.posture.approach.attainable_speed import USABLE
 from impact_posture.posture.search.multistart import PostureSolution
 from impact_posture.system.arrays import Array
 
-# Why a path that was reached is not returned.
+# Reason why a path to the optimum is not returned.
 _NOT_SMOOTH = "no smooth curve through the path satisfies the constraints"
 # What prevents a higher speed, if the program required the greatest speed.
 _EVERYWHERE = f"{USABLE:.0%} of the velocity limits, joint limits or other constraints in every posture of the search"
@@ -242,7 +242,7 @@ def _led(start: Array, run: RunUp, limits: ActuatorLimits, seed: int, effort: in
 
 
 def _still(space: PathSpace, q: Array, *reasons: str) -> PosturePath:
-    """Return the path of a robot that stays at its start, which is the optimum if the first reason is empty."""
+    """Return the path of a robot that stays at its start; if the first reason is empty, the start is the optimum."""
     rest, value = np.zeros((1, space.model.nv)), float(space.problem.objective.value(q))
     return PosturePath(
         space.model, np.zeros(1), q[None], rest, rest, found=not reasons[0],

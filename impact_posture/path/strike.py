@@ -26,7 +26,7 @@ from impact_posture.system.arrays import Array, null_space
 
 # Weight of the squared velocities, relative to their limits, which are added to the largest relative velocity.
 _UNIQUE = 1e-4
-# Weight of the share of the room that exceeds 1, relative to the largest share of a velocity limit.
+# Weight of a run-up beyond a bound (r in :func:`impact_velocity`), relative to the largest share of a velocity limit.
 _CROWDED = 100.0
 # If the curve of a run-up bends across an active bound at once, the robot comes from the inside of this bound, with
 # this share of the contact speed (rad/s or m/s).
@@ -125,8 +125,9 @@ def impact_velocity(
     The velocity minimizes the largest of ``|ν_i|/ν̄_i`` and, if ``balanced``, of the shares of :func:`_tipping`, plus
     a small weight times ``Σ (ν_i/ν̄_i)²`` that makes it unique.  Entries without a limit count only in the sum, in
     rad/s or m/s.  If possible, ``q − νt`` is within inequalities and joint limits to first order, where ``t`` is the
-    ``time``, s.  If not, the smallest share of ``ν`` does not fit.  If ``inside``, the robot comes from the inside of
-    active bounds with :data:`_RATE`.  Return ``None`` if no velocity exists.
+    ``time``, s.  If not, the violation, relative to the distance from the bound, is as small as possible.  If
+    ``inside``, the robot comes from the inside of active bounds with :data:`_RATE`.  Return ``None`` if no velocity
+    exists.
     """
     robot = spaces.run_up.problem.robot
     limited = np.isfinite(robot.velocity_limits)

@@ -16,8 +16,8 @@ from impact_posture.path.timed_curve import moment
 from impact_posture.posture.approach.attainable_speed import RUN_UP
 from impact_posture.system.arrays import Array
 
-# Lengths of a stroke, s, measured as the time at the velocity of the impact.  A length is used if the shorter lengths
-# do not suffice.
+# Lengths of a stroke, s, measured as the time at the velocity of the impact.  A longer length is tried only if the
+# shorter lengths do not suffice.
 _LENGTHS = (0.1, 0.5, 1.5)
 # Tangent length between two knots of a stroke, rad mixed with m.
 _KNOTS = STEP / 2
@@ -36,7 +36,7 @@ _DEFLECTED = 0.01
 # Singular values below this share of the largest one are zero.
 _RANK = 1e-9
 # Shortest duration of a run-up, s, which a controller can follow: without rotors, and with rotors, whose thrust lags.
-# A stop is shorter only if it must be.
+# A stop also takes at least this time, unless its curve is too short.
 SHORTEST = (RUN_UP, 0.2)
 # Ratio of successive trial durations of a stroke.
 _LONGER = 1.3
@@ -143,7 +143,7 @@ class Stroke:
         return worst
 
     def shortest(self, limits: ActuatorLimits, factor: float = 1.0) -> float | None:
-        """Return the shortest duration within the limits, s; ``None`` if the curve is too short for any."""
+        """Return the shortest duration within the limits, s; ``None`` if the curve is too short for any duration."""
         most = self._longest(factor)
         if self._too_short(limits, factor):
             return None

@@ -93,7 +93,7 @@ def run(factory: ControllerFactory, controller: str, *, seed: int = 0, mode: Mod
 
 
 class _Loop:
-    """Loop of controller and world, in C if both have C code and no posture moves, otherwise in Python."""
+    """Loop of controller and world: in C if both have C code and the posture reference rests, else in Python."""
 
     def __init__(self, factory: ControllerFactory, driver: Driver, seed: int) -> None:
         setup = factory.setup

@@ -1,4 +1,4 @@
-"""The front of a contact: exact for boxes, cylinders, spheres and capsules, and a warning where it is ahead."""
+"""The foremost point of a contact link: exact for boxes, cylinders, spheres and capsules, and named in a warning."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Links without shapes and meshes that are left out are said on standard error, in result.json and by inspect."""
+"""Warnings about links without shapes, and about omitted meshes: on standard error, in result.json and by inspect."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Changed files in the store of finished runs run again or give an error, even if their checksums fit.
+"""A finished run whose stored files were changed runs again or gives an error, even if the checksums match.
 
 ``--hostile-full`` tries many more changes.
 """

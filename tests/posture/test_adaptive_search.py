@@ -183,8 +183,8 @@ def test_collisions_and_loads_stay_excluded(robot: str, normal: tuple[float, flo
 
 
 def test_feasible_starts_descend_where_few_random_postures_reach_the_equalities() -> None:
-    # The best objective of 128 starts is 2.904.  One random posture in a thousand leads there, but four of a hundred
-    # feasible starts.
+    # The best objective of 128 starts is 2.904.  One random posture in a thousand leads to this objective, but four
+    # of a hundred feasible starts do.
     problem = prepare(
         make_settings({"robot": "solo8", "normal": (0, 0, 1), "collision": True, "holdable": True})
     ).problem

@@ -65,7 +65,7 @@ def test_speed_time_and_jump_of_the_contacts_are_as_planned() -> None:
         # The prediction contains the restitution 0.13 of the surface.
         assert prediction.ratio == pytest.approx(1.0, abs=0.05)
         # The posture at the contact is the planned one, up to the lag of the soft posture task.  No motor is at its
-        # limit before.
+        # limit before the contact.
         k = int(np.searchsorted(record.series.t, window.begin)) - 1
         assert np.abs(record.series.q[k] - path.q[-1]).max() < 0.1
         effort = np.asarray(factory.setup.robot.model.effortLimit)
@@ -101,7 +101,7 @@ def test_a_contact_50_ms_early_or_late_is_survived(late: float, monkeypatch: pyt
     (prediction,) = predict(factory.setup, factory.objective(), record)
     planned = (height(path, end + late) - height(path, end + late + 1e-4)) / 1e-4 if late < 0 else 0.5
     assert prediction.approach == pytest.approx(planned, rel=0.15)
-    # No motor is at its limit, before or after.
+    # No motor is at its limit, neither before nor after the contact.
     assert (np.abs(record.series.torque) < 0.999 * np.asarray(factory.setup.robot.model.effortLimit)).all()
     # The references stop at the contact, so the arm is at rest soon afterwards.
     after = (record.series.t > window.begin + 0.25) & (record.series.t < window.begin + 0.3)

@@ -222,7 +222,7 @@ def test_a_damaged_manifest_is_written_again(solved: tuple[Sweep, str, Path], tm
 
 @pytest.mark.parametrize("what", ["shards", "another sweep", "a foreign file", "a damaged shard"])
 def test_a_folder_without_its_manifest(what: str, solved: tuple[Sweep, str, Path], tmp_path: Path) -> None:
-    """Only files that their checksums prove to be shards are used, or removed by force."""
+    """Only files whose checksums prove that they are shards are used, or removed by force."""
     sweep, key, folder = solved
     out = Path(shutil.copytree(folder, tmp_path / "out"))
     (out / "manifest.json").unlink()

@@ -234,7 +234,7 @@ def test_a_changed_file_is_named_before_a_folder_is_replaced(tmp_path: Path) -> 
     with pytest.raises(OutputError, match=r"exists, and it holds changes of yours in c/a\.c; .*`force`"):
         write(out, "new")
     write(out, "new", force=True)
-    # A part with a newer record of its own is not changed.
+    # A subfolder with a newer record of its own does not count as changed.
     shutil.rmtree(out / "c")
     write(out / "c", "newer")
     with pytest.raises(OutputError, match="exists;"):

@@ -14,7 +14,7 @@ import impact_posture
 from impact_posture.system.text_files import MOST_BYTES, MOST_CHARACTERS, open_regular, read_bytes, read_text
 
 ROOT = Path(impact_posture.__file__).parent
-# Modules that call these methods for other than files of users, and the reason.
+# Modules that may call these methods, because the files do not come from users, and what the modules do.
 ALLOWED = {
     "text_files.py": "opens regular files",
     "isolated_calls.py": "reads files of the kernel",

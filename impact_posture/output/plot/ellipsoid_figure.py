@@ -116,7 +116,7 @@ def square_panel(axes: Any, plane: Plane, limit: float, unit: str) -> None:
 
 
 def draw_normals(axes: Any, plane: Plane, named: list[tuple[str, Array]], limit: float) -> None:
-    """Draw the projection of each normal as an arrow; if n points out of the page, as a dot; into it, as a cross."""
+    """Draw the projection of each normal as an arrow, or as a dot (out of the page) or a cross (into the page)."""
     for name, n in named:
         flat = plane.axes @ n
         if np.linalg.norm(flat) < 0.05:

@@ -184,7 +184,7 @@ def header_lines(view: ResultView) -> tuple[str, list[str]]:
     if view.objective.others:
         facts.insert(0, f"{ALONE}: {contact.frame} alone; objective: all contacts together")
     if count := len(view.objective.model_variants):
-        facts.insert(0, f"drawn and in numbers: the nominal model; objective the worst of {count}")
+        facts.insert(0, f"figure and numbers: the nominal model; objective: the worst of {count} models")
     feet = [s.frame for s in view.objective.supports]
     facts.append(f"contact-consistent, on {', '.join(feet)}" if feet else "no supports")
     numbers = []

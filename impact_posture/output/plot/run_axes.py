@@ -59,7 +59,7 @@ def time_figure(
     title_at: str = "center",
     air: float = 0.75,
 ) -> Figure:
-    """Draw rows of cells with a header above and the legend beside them.  For ``None``, the place stays empty.
+    """Draw rows of cells with a header above and the legend beside them.  A cell that is ``None`` stays empty.
 
     Cells with the same panel share the limits of their vertical axes.  If cells of a column have the same time axis,
     only the lowest cell has a label.  ``height`` of a row and additional ``air`` are in inches.  ``widths`` are

@@ -80,7 +80,7 @@ class CompiledTick:
         self._controller.state.update(*self.library.measured)
 
     def _lead(self) -> list[str]:
-        """Send the changed targets to C.  Return the names of their tasks."""
+        """Send the changed targets to C, and return the names of the tasks with these targets."""
         moved = []
         for task in self._tasks:
             # Python assigns a new object to change a target, so a different object means a change.  If C changes a

@@ -54,11 +54,11 @@ MEANING: dict[str, str] = {
     "robust-release": "like robust, without the nominal posture stiffness until H stops decreasing",
     "robust-flow": "the posture flows to lower H before the impact, without a gain",
     "robust-flow-sticking": "like robust-flow, to lower S, for impacts at a given speed",
-    "posture": "the offline optimum as posture, no gradient",
+    "posture": "moves to the offline optimum, without the gradient",
     "posture-sticking": "like posture, with the optimum of S, for impacts at a given speed",
     "path": "like posture, but along a timed path without collisions",
     "strike": "arrives at the optimum of the sticking jump with the stated speed along a path, then stops",
-    "stiff": "the start posture, as stiff as the term is where robust rests",
+    "stiff": "holds the start posture, with the stiffness that the term has where robust rests",
     "posture-stiff": "like posture, with the stiffness of the impact-robust term at the optimum",
     "invariant": "nominal, but impulses do not affect the velocity feedback around the impact",
     "reference-spreading": "nominal, with references before and after the impact, without velocity feedback between",
@@ -179,7 +179,7 @@ class ControllerFactory:
 
     @cached_property
     def strike(self) -> PosturePath:
-        """Path that the controller ``strike`` follows from the start posture, to the speed of the contacts.
+        """Path of the controller ``strike`` from the start posture to the contact at the stated speed.
 
         Raises:
             InputError: The scenario has no contacts, or no strike is possible.
