@@ -29,6 +29,17 @@ from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 from impact_posture.system.escape import c_comment
+from impact_posture.tsid import controller, relaxation
+from impact_posture.tsid.flow import (
+    flow_direction,
+    flow_governor,
+    flow_probes,
+    redundancy,
+    reference_flow,
+    static_controls,
+    zero_moment_point,
+)
+from impact_posture.tsid.qp import level_rank
 from impact_posture.version import __version__
 
 # Files of the folder c/, in the order in which they are joined.
@@ -45,6 +56,19 @@ _RELAXATION = (
 # Parameters that ``init`` compares with other parameters.  The C code needs a named index for each of these
 # parameters.
 _NAMED = ("control_upper", "joint_upper", "contact_normal", "law_rate", "posture_weight", "task_weight")
+# Module → names of its constants that the C code uses; the module describes them.
+_CONSTANTS = {
+    controller: "LONGEST ABSURD",
+    relaxation: "OFF",
+    level_rank: "SINGULAR DROPPED LEAST",
+    reference_flow: "PROBE MOVED REACHED STILL SLOW UPDATE_TICKS UNTIL SINCE",
+    flow_probes: "NEW",
+    flow_direction: "LEAST_VALUE LEVEL NEAR SPENT AIM RESERVE FLAT",
+    flow_governor: "ATTEMPTS ABLE CAUTION RATE RETURN",
+    redundancy: "SLACK SPRING IDLE",
+    static_controls: "MOMENT LEFT EVEN TINY",
+    zero_moment_point: "ZMP_SHARE ZMP_LEAST",
+}
 # Stack bytes of a tick apart from arrays: variables, saved registers and return addresses of all functions.
 _FRAMES = 4096
 
@@ -175,6 +199,8 @@ def render(
         "stack_bytes": -(-max(code.stack_bytes, solver + 16 * nv * 8) // 64) * 64 + _FRAMES,
         "identity": identity, "tables": tables, "named": named_fields, "literals": _initializer,
         "rules": _braced(str(x) for f in fields for x in (f.value.size, RULES[f.rule])),
+        "constants": [(name, repr(getattr(module, name)), module.__name__.rpartition(".")[2])
+                      for module, names in _CONSTANTS.items() for name in names.split()],
         "core": "\n".join(core_text(name) for name in _files(sizes)),
     }  # fmt: skip
     templates = environment("impact_posture.controller_export", c_comment)
@@ -192,7 +218,7 @@ def render(
         generated |= {} if part is None else {"code": part, "places": _braced(map(str, part.angles))}
         texts[name] = templates.get_template(f"{template}.jinja").render(context | generated)
     texts = {name: named(text, prefix) for name, text in texts.items()}
-    for name, text in relaxation().items():
+    for name, text in relaxation_sources().items():
         text = re.sub(r"\b(daqp\.h|relaxation\.h)", rf"{prefix}_\1", text)
         texts[f"{prefix}_{name}"] = named(text, prefix)
     return texts
@@ -211,7 +237,7 @@ def _relaxation_room(n: int, m: int, levels: int) -> int:
     return matrices + 16 * n + 7 * active + (20 + levels) * entries + 64
 
 
-def relaxation() -> dict[str, str]:
+def relaxation_sources() -> dict[str, str]:
     """Return file name → text of the relaxation, whose C names have no prefix yet."""
     return {
         "relaxation.h": core_text("relaxation.h"),

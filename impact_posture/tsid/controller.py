@@ -27,12 +27,12 @@ from impact_posture.tsid.tasks.task import Task
 
 # Largest time step of ramps, in periods of the controller.  Without this bound, a tick after a long pause would end a
 # ramp.
-_LONGEST = 10
+LONGEST = 10
 # Least nv for which LAPACK factorizes the cost (:class:`WhitenedSolver`).  For smaller robots, this saves no time.
 _LARGE = 20
 # A measured vector is invalid if the sum of its squared entries exceeds this value.  The square root of this value is
 # 1e8 (m, rad/s or N).
-_ABSURD = 1e16
+ABSURD = 1e16
 # Largest violation of a control limit, relative to the largest limit.
 _EXCESS = 1e-6
 # Joint damping that is added to a repeated command, divided by the inertia of the joint, 1/s.
@@ -155,7 +155,7 @@ class Controller:
         """
         q = self.robot.check_posture(np.asarray(q, dtype=float), limits=False)
         v = checked_velocity(self.robot, v)
-        if not math.hypot(*q, *v) < math.sqrt(_ABSURD):
+        if not math.hypot(*q, *v) < math.sqrt(ABSURD):
             raise PostureError("q or ν is too large for a measurement", where="reset", hint="give SI units")
         state, assembly = self.state, self.assembly
         state.push(None)
@@ -198,14 +198,14 @@ class Controller:
         q, v = np.asarray(q, dtype=float), np.asarray(v, dtype=float)
         if q.shape != state.q.shape or v.shape != state.v.shape:
             raise ValueError(f"q and v have shapes {q.shape} and {v.shape}, not {state.q.shape} and {state.v.shape}")
-        # If the sum of squares is finite and below ``_ABSURD``, every number is finite and not too large.
+        # If the sum of squares is finite and below ``ABSURD``, every number is finite and not too large.
         total = q.dot(q) + v.dot(v)
         if force is not None:
             force = np.asarray(force, dtype=float)
             total += force.dot(force)
-        if not (total < _ABSURD and math.isfinite(t)) or self._far_from_unit(q):
+        if not (total < ABSURD and math.isfinite(t)) or self._far_from_unit(q):
             return self._held(Status.NON_FINITE, v)
-        dt = self.period if self._t is None else min(max(t - self._t, 0.0), _LONGEST * self.period)
+        dt = self.period if self._t is None else min(max(t - self._t, 0.0), LONGEST * self.period)
         self._t = t
         state.push(force)
         state.update(q, v)
@@ -282,7 +282,7 @@ class Controller:
         actuators, u = self.actuators, self._u.copy()
         self._status, self._outcome = status, Outcome(None)
         rates = v[actuators.base :]
-        u[actuators.rotors :] -= self._damping * np.where(np.abs(rates) < math.sqrt(_ABSURD), rates, 0.0)
+        u[actuators.rotors :] -= self._damping * np.where(np.abs(rates) < math.sqrt(ABSURD), rates, 0.0)
         np.clip(u, actuators.lower, actuators.upper, out=u)
         return self._command(u, status, np.zeros(self.robot.nv), np.zeros(self.assembly.contacts.size))
 

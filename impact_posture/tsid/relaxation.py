@@ -14,7 +14,7 @@ from impact_posture.tsid.qp.hierarchy import Level, lexicographic
 from impact_posture.tsid.qp.quadratic_program import EQUALITY, QP, Solved
 
 # A row counts as satisfied if its error is below this share of the sum of its absolute terms.
-_OFF = 1e-6
+OFF = 1e-6
 # A row that violates a bound by more than this keeps its value while the cost is minimized.  The violation is
 # relative to the norm of the row times the norm of z.
 _MISSES = 1e-9
@@ -132,7 +132,7 @@ def missed(assembly: Assembly, z: Array, *, equations: bool) -> tuple[Relaxed, .
         rows = assembly.rank.rows(level, equations)
         A = assembly.rank.qp.A[rows]
         off, size = A @ z - assembly.rank.wanted[rows], 1.0 + float(np.max(np.abs(A) @ np.abs(z), initial=0.0))
-        if float(np.max(np.abs(off), initial=0.0)) > _OFF * size:
+        if float(np.max(np.abs(off), initial=0.0)) > OFF * size:
             levels.append(Relaxed(name, float(np.linalg.norm(off))))
     return tuple(levels)
 
@@ -141,7 +141,7 @@ def _gave_way(assembly: Assembly, z: Array) -> tuple[Relaxed, ...]:
     qp, limits = assembly.qp, assembly.limits
     values = qp.values(z)[limits]
     most = float(np.max(np.maximum(qp.lower[limits] - values, values - qp.upper[limits]), initial=0.0))
-    opened = most > _OFF * (1.0 + float(np.max(np.abs(values))))
+    opened = most > OFF * (1.0 + float(np.max(np.abs(values))))
     return (*([Relaxed("joint limits", most)] if opened else []), *missed(assembly, z, equations=True))
 
 

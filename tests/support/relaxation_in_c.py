@@ -55,7 +55,7 @@ class Relaxation:
         """Compile in a folder; warnings about the project's code are errors."""
         for name, content in sources_or_skip().items():
             (folder / name).write_bytes(content)
-        for name, text in render.relaxation().items():
+        for name, text in render.relaxation_sources().items():
             (folder / name).write_text(text, encoding="utf-8")
         compiler = ["cc", "-O1", "-fPIC", *flags]
         subprocess.run(

@@ -2,8 +2,6 @@
 
 /* Number of rows of the QP, without the rows that bound joint accelerations. */
 #define IP_OTHERS (IP_GENERAL - (IP_DENSE ? IP_BOUNDED : 0))
-/* A row counts as satisfied if its error is below this share of the sum of its absolute terms. */
-#define IP_OFF 1e-6
 /* Unit of contact forces, divided by the mass of the robot times 1 m/s2.  Of the values from 0.03 to 10, this value
  * led to the fewest iterations for pushed robots. */
 #define IP_FORCE_UNIT 0.1

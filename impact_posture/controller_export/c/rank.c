@@ -1,11 +1,6 @@
 /* Strict levels of any rank, as in LevelRank (level_rank.py): dependent rows are removed from the program, and nearly
  * dependent rows are damped. */
 
-/* As in level_rank.py: IP_SINGULAR is SINGULAR, IP_DROPPED is _NOTHING, and IP_LEAST is _LEAST. */
-#define IP_SINGULAR 2e-2
-#define IP_DROPPED 1e-9
-#define IP_LEAST 1e-8
-
 /* Typical size of a variable if accelerations have the size 1. */
 static double ip_size(const ip_context *c, int k)
 {

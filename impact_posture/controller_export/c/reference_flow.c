@@ -1,23 +1,6 @@
 /* The reference flow: a posture q_r that moves to lower impacts with limited speed and acceleration, while contacts
- * and tasks hold.  The posture task follows q_r.  The work of an update is spread over IP_FLOW_PHASES ticks, so that
+ * and tasks hold.  The posture task follows q_r.  The work of an update is spread over IP_UPDATE_TICKS ticks, so that
  * all ticks need similar times.  The formulas are in impact_posture/tsid/flow/reference_flow.py. */
-
-/* Number of ticks per update.  IP_FLOW_UNTIL is the tick of the first change of the acceleration.  The second change
- * is IP_FLOW_SINCE ticks before the next evaluation. */
-#define IP_FLOW_PHASES 14
-#define IP_FLOW_UNTIL 4
-#define IP_FLOW_SINCE 3
-
-/* Step of the finite differences, rad. */
-#define IP_PROBE 1e-4
-/* If the step towards a posture of the path is shorter than this, rad (m), the flow continues to the next posture. */
-#define IP_REACHED 0.02
-/* Curvature estimates are updated only if two evaluations are at least this far apart, rad (m). */
-#define IP_MOVED 1e-6
-/* A direction that is shorter than this after the orthogonalization has large errors and is orthogonalized again. */
-#define IP_NEW 0.1
-/* Below this speed, rad/s (m/s), the point where the flow would stop is too near for finite differences. */
-#define IP_SLOW 1e-3
 
 /* Evaluate the model and the Jacobian of the constraints at a posture with v = 0.  Write the errors of the
  * constraints if `error` is not null. */
@@ -83,10 +66,10 @@ static void ip_flow_look(ip_context *c)
 {
   ip_flow *f = &c->flow;
   double ahead[IP_NQ], mean[IP_NV];
-  const double dt = f->elapsed / IP_FLOW_SINCE;
+  const double dt = f->elapsed / IP_SINCE;
   memcpy(mean, f->velocity, sizeof mean);
-  ip_add(mean, (IP_FLOW_UNTIL + 1) / 2.0 * dt, f->acceleration, IP_NV);
-  ip_integrate(f->q, mean, IP_FLOW_UNTIL * dt, ahead);
+  ip_add(mean, (IP_UNTIL + 1) / 2.0 * dt, f->acceleration, IP_NV);
+  ip_integrate(f->q, mean, IP_UNTIL * dt, ahead);
   ip_difference(ahead, f->here, f->z);
   f->length = sqrt(ip_dot(f->z, f->z, IP_NV));
   memcpy(f->here, ahead, sizeof f->here);

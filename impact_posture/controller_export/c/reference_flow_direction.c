@@ -1,9 +1,6 @@
 /* Direction of the reference flow: a saddle-free Newton step on the constraints, solved as a QP with limits.  The
  * formulas are in impact_posture/tsid/flow/flow_direction.py. */
 
-/* Least value of H/H0 in sqrt(H/H0). */
-#define IP_LEAST_VALUE 1e-8
-
 /* Write the limits on a step along f->axes (NV x left) as rows into f->work, with their bounds. */
 static void ip_flow_rows(ip_flow *f)
 {

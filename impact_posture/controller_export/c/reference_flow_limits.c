@@ -1,17 +1,6 @@
 /* Limits of the reference flow: distances from the limits, and changes of the flow that do not cross them.  The
  * formulas are in impact_posture/tsid/flow/flow_direction.py. */
 
-/* The flow may move along a limit that it violates by less than this.  If this value equaled IP_NEAR, the flow would
- * slowly cross the limit. */
-#define IP_SPENT 9.9e-4
-/* Distance that the flow keeps from joint limits, rad (m), and from limits of static controls, as a share. */
-#define IP_AIM 2e-3
-#define IP_RESERVE 8e-3
-/* A row of the limits is ignored if the square of its length along the free directions is smaller than this. */
-#define IP_FLAT 1e-6
-/* Below this sine of the tilt angle, the tilt axis is undefined, and the slope of the tilt is set to zero. */
-#define IP_LEVEL 1e-6
-
 /* Return the largest absolute value from the entry `first` on. */
 static double ip_largest(const double *x, int first)
 {

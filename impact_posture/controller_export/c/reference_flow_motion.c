@@ -1,21 +1,5 @@
 /* Motion of the reference flow: its governor, its start, and the tasks that follow the flow. */
 
-/* Time constant of the return to contacts and tasks, s.  IP_STILL is the speed below which a flow that is off is set
- * to rest, rad/s (m/s). */
-#define IP_RETURN 0.1
-#define IP_STILL 1e-5
-/* Largest violation of a limit during braking, rad (m) for joints, and a share of the range for static controls. */
-#define IP_NEAR 1e-3
-/* Attempts for each step that ip_flow_change tries: one unchanged, two without the part that crosses limits. */
-#define IP_ATTEMPTS 3
-/* The flow assumes a share of the largest acceleration for braking.  This share is at least IP_ABLE, and increases by
- * at most IP_ABLE per change. */
-#define IP_ABLE 0.1
-/* Safety factor of the braking time, because the slopes of the limits change during braking. */
-#define IP_CAUTION 1.5
-/* Largest ratio of the speed of the flow to its step, 1/s. */
-#define IP_RATE 4.8
-
 /* Scale x down so that no absolute value of an entry exceeds a number. */
 static void ip_shorten(double *x, double most)
 {
@@ -301,7 +285,7 @@ static void ip_flow_curve(ip_context *c)
 static void ip_flow_lead(ip_context *c, double dt)
 {
   /* The ticks of ip_flow_look, ip_flow_govern and ip_flow_direct are the same as in Python. */
-  static void (*const parts[IP_FLOW_PHASES])(ip_context *) = {
+  static void (*const parts[IP_UPDATE_TICKS])(ip_context *) = {
     ip_flow_look,    ip_flow_decompose, ip_flow_split, ip_flow_limit, ip_flow_govern, ip_flow_probe, ip_flow_compare,
     ip_flow_curve,   ip_flow_curve,     ip_flow_curve, ip_flow_curve, ip_flow_govern, ip_flow_curve, ip_flow_direct,
   };
@@ -313,7 +297,7 @@ static void ip_flow_lead(ip_context *c, double dt)
   f->clock += dt;
   f->elapsed += dt;
   parts[f->phase](c);
-  f->phase = (f->phase + 1) % IP_FLOW_PHASES;
+  f->phase = (f->phase + 1) % IP_UPDATE_TICKS;
   ip_add(f->velocity, dt, f->acceleration, IP_NV);
   ip_integrate(f->q, f->velocity, dt, f->q);
   if (!f->on && ip_largest(f->velocity, 0) <= IP_STILL) {

@@ -1,23 +1,8 @@
 /* Redundancy of the reference flow, and the static controls that hold its posture.  The formulas are in
  * impact_posture/tsid/flow/redundancy.py and static_controls.py. */
 
-/* A direction gets a spring instead of a constraint if its singular value is below this share of the largest one.
- * IP_STIFFNESS is the stiffness of the springs relative to H0, 1/m2. */
-#define IP_SLACK 2e-2
-#define IP_SPRING 3e4
-/* Weight of a moment (N m), relative to a force (N), in the norm of contact wrenches.  IP_TINY is the share of the
- * trace that is added to the diagonal, so that the equations are solvable. */
-#define IP_MOMENT 100.0
-#define IP_TINY 1e-12
 /* Points with a smaller distance from a line, m, are treated as points on the line. */
 #define IP_ON_LINE 1e-9
-/* This value is added to the diagonal of the equations of ip_flow_still.  Without it, the equations would be
- * singular if the base can move without the joints. */
-#define IP_IDLE 1e-9
-/* Accelerations may use at least this share of the half range of a control, even if the static controls leave less. */
-#define IP_LEFT 0.1
-/* Each of n soles carries at least this share of the weight, divided by n. */
-#define IP_EVEN 0.6
 
 #if IP_BASE
 /* Solve R'R x = b in place, R upper triangular in n x n. */

@@ -1,11 +1,6 @@
 /* Bounds on the acceleration that keep the zero moment point of a standing robot in the polygon of its feet.  The
  * formulas are in impact_posture/tsid/flow/zero_moment_point.py. */
 
-/* Accelerations may use this share of the distance from the center of mass to an edge.  IP_ZMP_LEAST, m, replaces
- * a shorter distance. */
-#define IP_ZMP_SHARE 0.8
-#define IP_ZMP_LEAST 0.01
-
 /* Set the rows and their bounds.  The effect of the known acceleration is subtracted from the bounds. */
 static void ip_flow_limit_zmp(ip_flow *f, const double *known)
 {

@@ -1,10 +1,5 @@
 /* Functions of the header: reset, tick, and changes of targets and phases. */
 
-/* Largest time step of ramps, in periods.  Without this bound, a tick after a long pause would end a ramp. */
-#define IP_LONGEST 10.0
-/* A measured vector is invalid if the sum of its squared entries exceeds this value, the square
- * of 1e8 m, rad/s or N. */
-#define IP_ABSURD 1e16
 /* Times with a smaller difference, s, are equal, because sums of periods are not exact. */
 #define IP_SAME 1e-9
 

@@ -19,21 +19,21 @@ from impact_posture.tsid.qp.quadratic_program import QP
 from impact_posture.tsid.state import State
 
 # Least value of ``H/H₀`` in ``√(H/H₀)``.
-_LEAST = 1e-8
+LEAST_VALUE = 1e-8
 # Below this sine of the tilt angle, the tilt axis is undefined, and the slope of the tilt is set to zero.
-_LEVEL = 1e-6
+LEVEL = 1e-6
 # Largest violation of a limit during braking, rad (m) for joints, and a share of the range for static controls.
-_NEAR = 1e-3
-# The flow may move along a limit that it violates by less than this, in the units of ``_NEAR``.  If this value
-# equaled ``_NEAR``, the flow would slowly cross the limit.
-_SPENT = 9.9e-4
+NEAR = 1e-3
+# The flow may move along a limit that it violates by less than this, in the units of ``NEAR``.  If this value equaled
+# ``NEAR``, the flow would slowly cross the limit.
+SPENT = 9.9e-4
 # Distance that the flow keeps from the joint limits, rad (m).
-_AIM = 2e-3
+AIM = 2e-3
 # Distance that the flow keeps from the limits of the static controls, as a share of the range.  This distance is
-# larger than ``_AIM``, because the slope of the static controls is only estimated.
-_RESERVE = 8e-3
+# larger than ``AIM``, because the slope of the static controls is only estimated.
+RESERVE = 8e-3
 # A row of the limits is ignored if the square of its length along the free directions is smaller than this.
-_FLAT = 1e-6
+FLAT = 1e-6
 _PositiveShare = Annotated[float, Demand(lambda value: 0 < value <= 1, "a number above zero, up to 1")]
 
 
@@ -151,18 +151,18 @@ class FlowDirection:
             vertical = state.base_rotation[2]
             axis = np.cross(vertical, self._up)
             sine = math.sqrt(float(axis @ axis))
-            self._rows[count, 3:6] = axis / sine if sine > _LEVEL else 0.0
+            self._rows[count, 3:6] = axis / sine if sine > LEVEL else 0.0
             self._angle, self._vertical[:] = math.atan2(sine, float(vertical @ self._up)), vertical
             upper[count] = self._tilt - self._angle
             count += 1
         upper[count:] = 1.0 - shares
         lower[count:] = -1.0 - shares
-        for rows, aim in ((slice(0, self._joints.size), _AIM), (slice(count, None), _RESERVE)):
+        for rows, aim in ((slice(0, self._joints.size), AIM), (slice(count, None), RESERVE)):
             upper[rows] -= aim
             lower[rows] += aim
         ahead = self._rows @ coasting
-        np.maximum(upper, -_SPENT, out=self._room[0])
-        np.minimum(lower, _SPENT, out=self._room[1])
+        np.maximum(upper, -SPENT, out=self._room[0])
+        np.minimum(lower, SPENT, out=self._room[1])
         np.maximum(upper - np.maximum(ahead, 0.0), 0.0, out=upper)
         np.minimum(lower - np.minimum(ahead, 0.0), 0.0, out=lower)
 
@@ -172,7 +172,7 @@ class FlowDirection:
         ``gradient`` is ``∇H/H₀``, shape (nv,), ``value`` is ``H/H₀``, and ``offset`` is ``q_r ⊖ q₀``, shape (nv,).
         ``error`` is the error of the constraints, shape (rows,).
         """
-        Z, root = space.basis, math.sqrt(max(abs(value), _LEAST))
+        Z, root = space.basis, math.sqrt(max(abs(value), LEAST_VALUE))
         slope = Z.T @ (gradient / root + self._pull * offset)
         curvature = Z.T @ (self.B / root) @ Z + (Z.T * self._pull) @ Z
         if space.springs is not None:
@@ -208,7 +208,7 @@ class FlowDirection:
         ahead = self._rows @ displacement
         if self._up is not None:
             ahead[self._tilting] = self._tilt_change(displacement, float(ahead[self._tilting]))
-        return not float(np.maximum(ahead - self._room[0], self._room[1] - ahead).max(initial=0.0)) > _NEAR
+        return not float(np.maximum(ahead - self._room[0], self._room[1] - ahead).max(initial=0.0)) > NEAR
 
     def _tilt_change(self, displacement: Array, along: float) -> float:
         """Return the change of the tilt angle caused by a displacement, shape (nv,).
@@ -235,7 +235,7 @@ class FlowDirection:
                 continue
             across = Z @ (Z.T @ row)
             square = float(across @ across)
-            if square > _FLAT:
+            if square > FLAT:
                 step = step - across * ((ahead - min(max(ahead, low), high)) / time / square)
         return step
 

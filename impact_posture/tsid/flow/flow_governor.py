@@ -12,18 +12,18 @@ from impact_posture.tsid.flow.redundancy import Redundancy
 from impact_posture.tsid.flow.zero_moment_point import ZeroMomentPoint
 
 # Attempts per candidate of `change`: first unchanged, then twice without the part that crosses limits.
-_ATTEMPTS = 3
-# The flow assumes a share of the largest acceleration for braking.  This share is at least ``_ABLE``, and increases
-# by at most ``_ABLE`` per change.
-_ABLE = 0.1
+ATTEMPTS = 3
+# The flow assumes a share of the largest acceleration for braking.  This share is at least ``ABLE``, and increases
+# by at most ``ABLE`` per change.
+ABLE = 0.1
 # Safety factor of the braking time, because the slopes of the limits change during braking.
-_CAUTION = 1.5
+CAUTION = 1.5
 # Largest ratio of the speed of the flow to its step, 1/s.
-_RATE = 4.8
+RATE = 4.8
 # Smallest divisor when a speed is divided by a step, rad (m); prevents a division by zero.
 _TINY = 1e-12
 # Time constant with which ``q_r`` returns to the contacts and to the targets of the tasks, s.
-_RETURN = 0.1
+RETURN = 0.1
 
 
 class FlowGovernor:
@@ -47,7 +47,7 @@ class FlowGovernor:
         """
         options, size = self._options, max(float(np.abs(remaining).max(initial=0.0)), _TINY)
         # The deceleration ``2a/5`` stops a motion with the speed ``√(4ad/5)`` within the distance ``d``.
-        pace = min(1.0 / _RETURN, math.sqrt(0.8 * options.acceleration / size), options.speed / size)
+        pace = min(1.0 / RETURN, math.sqrt(0.8 * options.acceleration / size), options.speed / size)
         self.returning += limited(pace * remaining - self.returning, options.acceleration * period)
         return self.returning
 
@@ -81,14 +81,14 @@ class FlowGovernor:
         options, direction, Z, flow = self._options, self._direction, space.basis, self.flow
         most = options.acceleration * period
         # The deceleration ``2a/5`` stops a motion with the speed ``√(4aδ/5)`` within the step ``δ``.
-        pace = min(math.sqrt(0.8 * options.acceleration / max(np.abs(step).max(), _TINY)), _RATE)
+        pace = min(math.sqrt(0.8 * options.acceleration / max(np.abs(step).max(), _TINY)), RATE)
         away = limited(pace * step, fastest) - flow
         # The displacement ``stop`` is twice the braking distance, because the curvature may increase during braking.
         stop = flow * self.stopping(flow)
         fast = space.project(np.minimum(np.maximum(away, -most), most))
         for change, keeps in ((fast, True), (away, False)):
             change = limited(change, most)
-            for attempt in range(_ATTEMPTS):
+            for attempt in range(ATTEMPTS):
                 if keeps and float(change @ flow) >= 0:
                     change = zmp.keep(space, period, change)
                 if attempt:
@@ -105,7 +105,7 @@ class FlowGovernor:
 
         ``part`` is the share of the change that the actuators permit, 0 to 1.
         """
-        self._able = min(max(part, _ABLE), self._able + _ABLE)
+        self._able = min(max(part, ABLE), self._able + ABLE)
         change = change * part
         self.flow = self.flow + change
         return change
@@ -121,7 +121,7 @@ class FlowGovernor:
 
     def _braking(self, change: Array, period: float) -> float:
         """Return the time, s, in which the new velocity covers the distance of change and braking together."""
-        return _CAUTION * self.stopping(self.flow + change) / 2 / self._able + period
+        return CAUTION * self.stopping(self.flow + change) / 2 / self._able + period
 
 
 def limited(vector: Array, largest: float) -> Array:

@@ -13,7 +13,7 @@ from impact_posture.tsid.flow.redundancy import Redundancy
 _EMPTY = 1e-24
 # A direction that is shorter than this after the orthogonalization is orthogonalized again, because its rounding
 # errors are large.
-_NEW = 0.1
+NEW = 0.1
 
 
 class ProbeDirections:
@@ -42,6 +42,6 @@ class ProbeDirections:
             z[:] = space.project(z - (seen @ z) @ seen)
             length = math.sqrt(max(float(z @ z), _EMPTY))
             z /= length
-            if length > _NEW:
+            if length > NEW:
                 break
         return np.asarray(z)

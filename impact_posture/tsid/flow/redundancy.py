@@ -11,12 +11,12 @@ from impact_posture.system.arrays import Array
 # A direction gets a spring instead of a constraint if its singular value is below this share of the largest one.
 # Rows of points on one body can be almost dependent.  As constraints, these rows would switch on and off from posture
 # to posture, and the flow would never rest.
-_SOFT = 2e-2
+SLACK = 2e-2
 # Stiffness of the springs relative to ``H₀``, 1/m²: the energy at an error of 6 mm is about half of ``H₀``.
-_STIFFNESS = 3e4
+SPRING = 3e4
 # This value is added to the diagonal of the equations in :meth:`Redundancy.back`, which would otherwise be singular
 # if the base can move while the joints are at rest.
-_IDLE = 1e-9
+IDLE = 1e-9
 
 
 @dataclass(frozen=True)
@@ -43,13 +43,13 @@ class Redundancy:
         if not rows:
             return cls(np.eye(nv), np.zeros((nv, 0)))
         U, s, Vt = np.linalg.svd(J)
-        rank = int(np.count_nonzero(s > _SOFT * s[0]))
+        rank = int(np.count_nonzero(s > SLACK * s[0]))
         Z, soft = Vt[rank:].T, s[rank:]
         springs = stiffness = None
         if soft.size:
             springs, stiffness = np.zeros((rows, Z.shape[1])), np.zeros(Z.shape[1])
-            springs[:, : soft.size] = U[:, rank : s.size] * (_STIFFNESS * soft)
-            stiffness[: soft.size] = _STIFFNESS * soft**2
+            springs[:, : soft.size] = U[:, rank : s.size] * (SPRING * soft)
+            stiffness[: soft.size] = SPRING * soft**2
         return cls(Z, (Vt[:rank].T / s[:rank]) @ U[:, :rank].T, springs, stiffness)
 
     def project(self, vector: Array) -> Array:
@@ -65,6 +65,6 @@ class Redundancy:
         if base:
             joints = Z[base:]
             square = joints.T @ joints
-            square.flat[:: square.shape[0] + 1] += _IDLE
+            square.flat[:: square.shape[0] + 1] += IDLE
             back -= Z @ np.linalg.solve(square, joints.T @ back[base:])
         return np.asarray(back)

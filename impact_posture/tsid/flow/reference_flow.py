@@ -27,21 +27,21 @@ from impact_posture.tsid.tasks.impact_robust import Gradient
 from impact_posture.tsid.tasks.task import Task
 
 # Step of the finite differences along the redundancy, rad.
-_STEP = 1e-4
+PROBE = 1e-4
 # Curvature estimates are updated only if two evaluations are at least this far apart, rad (m).
-_MOVED = 1e-6
+MOVED = 1e-6
 # If the step towards a posture of the path is shorter than this, rad (m), the flow continues to the next posture.
 # The flow has then reached the posture, or the limits permit no closer posture.
-_REACHED = 0.02
+REACHED = 0.02
 # Speed below which a flow that is off is set to rest, rad/s (m/s).
-_STILL = 1e-5
+STILL = 1e-5
 # Below this speed, rad/s (m/s), the point where the flow would stop is too near for finite differences.
-_SLOW = 1e-3
+SLOW = 1e-3
 # Number of ticks from one update of the flow to the next.
 UPDATE_TICKS = 14
-# ``_UNTIL`` is the tick of the first change of the motion in an update.  ``_SINCE`` is the number of ticks from the
+# ``UNTIL`` is the tick of the first change of the motion in an update.  ``SINCE`` is the number of ticks from the
 # second change to the next evaluation.
-_UNTIL, _SINCE = 4, 3
+UNTIL, SINCE = 4, 3
 
 
 class ReferenceFlow:
@@ -151,16 +151,16 @@ class ReferenceFlow:
         tick, self._tick = self._tick, (self._tick + 1) % UPDATE_TICKS
         if tick == 0:
             self._look()
-        elif tick == _UNTIL:
+        elif tick == UNTIL:
             self._govern(measured)
             self._probe()
-        elif tick == UPDATE_TICKS - _SINCE:
+        elif tick == UPDATE_TICKS - SINCE:
             self._govern(measured)
         elif tick == UPDATE_TICKS - 1:
             self._direct()
         self.velocity += dt * self.acceleration
         self.q[:] = pin.integrate(self._model, self.q, dt * self.velocity)
-        if not self.on and np.abs(self.velocity).max() <= _STILL:
+        if not self.on and np.abs(self.velocity).max() <= STILL:
             self.velocity[:] = self.acceleration[:] = 0.0
 
     def start_at(self, q: Array) -> None:
@@ -186,9 +186,9 @@ class ReferenceFlow:
         Update the curvature estimates from the differences to the last evaluation.
         """
         state, direction = self._state, self.direction
-        dt = self._elapsed / _SINCE
+        dt = self._elapsed / SINCE
         ahead = pin.integrate(
-            self._model, self.q, _UNTIL * dt * (self.velocity + (_UNTIL + 1) / 2 * dt * self.acceleration)
+            self._model, self.q, UNTIL * dt * (self.velocity + (UNTIL + 1) / 2 * dt * self.acceleration)
         )
         moved, slope, shares = pin.difference(self._model, ahead, self._here), self._slope, self.shares
         self._place(ahead)
@@ -202,7 +202,7 @@ class ReferenceFlow:
         self.shares = self._static.shares(state, self._J)
         length = math.sqrt(float(moved @ moved))
         # The stored slope is zero if the gradient failed at the last evaluation.
-        if length > _MOVED and not self.failed and slope.any():
+        if length > MOVED and not self.failed and slope.any():
             self._learn(moved / length, length, slope - self._before.T @ self._multipliers, shares)
         self._before[:] = self._J
         rooms = self._offsets
@@ -222,11 +222,11 @@ class ReferenceFlow:
         self._probes_ahead = not self._probes_ahead
         flow = self._governor.flow
         size = math.sqrt(float(flow @ flow))
-        ahead = self._probes_ahead and size > _SLOW
+        ahead = self._probes_ahead and size > SLOW
         if ahead:
-            z, length = flow / size, max(size * self._governor.stopping(flow), _STEP)
+            z, length = flow / size, max(size * self._governor.stopping(flow), PROBE)
         else:
-            z, length = self._probes.next(self._space), _STEP
+            z, length = self._probes.next(self._space), PROBE
         q = pin.integrate(self._model, self._here, length * z)
         _, slope = self._evaluate(q)
         self._place(q)
@@ -252,7 +252,7 @@ class ReferenceFlow:
             remaining = pin.difference(self._model, self.q, self._path[self._visited])
             before = self.direction.failures
             self._wanted[:] = self.direction.towards(self._space.basis, remaining)
-            self._visited += int(self.direction.failures == before and np.abs(self._wanted).max() < _REACHED)
+            self._visited += int(self.direction.failures == before and np.abs(self._wanted).max() < REACHED)
             return
         offset = pin.difference(self._model, self._first, self._here)
         self._wanted[:] = self.direction.newton(self._space, self._slope, self.value / self.start, offset, self.error)

@@ -15,16 +15,16 @@ from impact_posture.tsid.state import State
 from impact_posture.tsid.support_contact import SupportContact
 
 # Weight of a moment (N·m), relative to a force (N), in the norm of contact wrenches.
-_MOMENT = 100.0
+MOMENT = 100.0
 # Accelerations may use at least this share of the half range of a control, even if the static controls leave less.
-_LEFT = 0.1
+LEFT = 0.1
 # Each of n soles carries at least this share of the weight, divided by n.
-_EVEN = 0.6
+EVEN = 0.6
 # If the direction of an edge is within this angle of −π, rad, the edge is sorted as if its direction were +π.
 _START = 1e-8
 # This share of the trace is added to the diagonal of the equations of the contact wrenches.  The equations are then
 # solvable even if the feet cannot carry every wrench on the base.
-_TINY = 1e-12
+TINY = 1e-12
 
 
 class StaticControls:
@@ -45,8 +45,8 @@ class StaticControls:
         self._middle, self._half = (upper + lower) / 2, share * (upper - lower) / 2
         # ``_whole`` is half of the full range.  ``_least`` is the least range that accelerations may use.  Both are
         # in units of half of the permitted range.
-        self._whole, self._least = 1.0 / share, _LEFT / share
-        wrench = np.array([1.0] * 3 + [_MOMENT] * 3)
+        self._whole, self._least = 1.0 / share, LEFT / share
+        wrench = np.array([1.0] * 3 + [MOMENT] * 3)
         self._ease = 1.0 / np.concatenate([np.zeros(0), *(wrench[: c.size] for c in contacts)])
         self._count, self._base = self._ease.size, base
         # Matrix that maps a generalized force, without the part that contacts produce, to the controls.
@@ -72,7 +72,7 @@ class StaticControls:
             eased = A * self._ease
             square = eased @ A.T
             # Feet on one line cannot carry a moment about this line, so the matrix would be singular.
-            square.flat[:: self._base + 1] += _TINY * square.trace()
+            square.flat[:: self._base + 1] += TINY * square.trace()
             _, wrenches, failed = self._solve(square, eased)
             if not failed:
                 np.matmul(J.T, wrenches.T, out=self._carried)
@@ -89,7 +89,7 @@ class StaticControls:
         taken, added = self._needed(M @ self._pair).T
         side = np.sign(added)
         left = most * np.maximum(self._whole - side * shares, self._least) - side * taken
-        return max(float((left / np.maximum(np.abs(added), _TINY)).min(initial=1.0)), 0.0)
+        return max(float((left / np.maximum(np.abs(added), TINY)).min(initial=1.0)), 0.0)
 
     def _needed(self, force: Array) -> Array:
         """Return the controls that produce generalized forces; shape (nv,) gives (m,), and (nv, k) gives (m, k)."""
@@ -122,7 +122,7 @@ def support_edges(state: State, contacts: Sequence[SupportContact]) -> tuple[Arr
     if not corners:
         return np.zeros((0, 2)), np.zeros(0)
     places = np.reshape(corners, (-1, 4, 2))
-    even = _EVEN if all(contact.size == 6 for contact in contacts) else 0.0
+    even = EVEN if all(contact.size == 6 for contact in contacts) else 0.0
     edges = polygon_edges(list((places + even * (places.mean(axis=0) - places)).reshape(-1, 2)))
     if edges is None:
         return np.vstack([np.eye(2), -np.eye(2)]), np.full(4, np.inf)

@@ -12,9 +12,9 @@ from impact_posture.tsid.state import State
 from impact_posture.tsid.support_contact import SupportContact
 
 # Share of the distance from the center of mass to an edge that accelerations may use.
-_SHARE = 0.8
+ZMP_SHARE = 0.8
 # A shorter distance from the center of mass to an edge is replaced by this distance, m.
-_LEAST = 0.01
+ZMP_LEAST = 0.01
 # A row of the bounds is ignored if the square of its length along the free directions is smaller than this.
 _TINY = 1e-12
 
@@ -52,8 +52,8 @@ class ZeroMomentPoint:
         moment = np.column_stack([n[:, 1], -n[:, 0], np.zeros(len(n))])
         wrench = np.hstack([force @ R, moment @ R])
         self._rows = wrench @ state.M[:6]
-        static = np.maximum(-wrench @ h, _LEAST * float(R[2] @ h[:3]))
-        self._room = _SHARE * static - self._rows @ known
+        static = np.maximum(-wrench @ h, ZMP_LEAST * float(R[2] @ h[:3]))
+        self._room = ZMP_SHARE * static - self._rows @ known
 
     def keep(self, space: Redundancy, period: float, step: Array) -> Array:
         """Return ``step`` without the parts that move the zero moment point beyond an edge.

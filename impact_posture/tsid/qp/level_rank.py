@@ -16,9 +16,9 @@ from impact_posture.tsid.smooth_step import smooth
 SINGULAR = 2e-2
 # Directions are removed if their ratio (see ``SINGULAR``) is below this share of ``SINGULAR``.  The share is far
 # above rounding errors, but too small for a visible effect.
-_NOTHING = 1e-9
+DROPPED = 1e-9
 # Least ``1 − α``, which limits the weight ``α/(1 − α)`` of a damped row.
-_LEAST = 1e-8
+LEAST = 1e-8
 
 
 class LevelRank:
@@ -130,10 +130,10 @@ class LevelRank:
             qp.upper[at] = np.where(held, self.wanted[rows], np.inf)
             alpha = smooth(x)
             directions = Z @ Vt.T
-            damped = np.flatnonzero((x > _NOTHING) & (x < 1.0))
+            damped = np.flatnonzero((x > DROPPED) & (x < 1.0))
             if damped.size:
                 weight = _mean_weight(self._full.H, Z, self._accelerations)
-                strength = weight * alpha[damped] / np.maximum(1.0 - alpha[damped], _LEAST) / s[damped] ** 2
+                strength = weight * alpha[damped] / np.maximum(1.0 - alpha[damped], LEAST) / s[damped] ** 2
                 J, c = qp.A[rows][damped], self.wanted[rows][damped]
                 q = np.zeros((n, damped.size))
                 q[: self._accelerations] = directions[: self._accelerations, damped]
