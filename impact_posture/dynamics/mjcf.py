@@ -171,9 +171,8 @@ def _depth_first(model: pin.Model) -> list[int]:
 
 def _is_free(model: pin.Model, slot: JointSlot) -> bool:
     """Return whether a MuJoCo free joint can represent a joint: a free-flyer on the world with equal armatures."""
-    if slot.kind.family != "free-flyer" or model.parents[slot.index] != 0:
-        return False
-    return bool(np.ptp(np.asarray(model.armature)[slot.v]) == 0)
+    on_world = slot.kind.family == "free-flyer" and model.parents[slot.index] == WORLD
+    return on_world and bool(np.ptp(np.asarray(model.armature)[slot.v]) == 0)
 
 
 def _link_name(model: pin.Model, joint: int) -> str:

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from functools import cache
-
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
 
 from impact_posture.dynamics.tree import PointOnLink
 from impact_posture.robot.model_joints import finite_armature
@@ -29,7 +26,7 @@ class Numeric:
         self.model.armature, self.locked = finite_armature(model)
         self.data = self.model.createData()
         self.q = pin.neutral(model)
-        self._zero, self._below = np.zeros(model.nv), _below_diagonal(model.nv)
+        self._zero, self._below = np.zeros(model.nv), np.tril_indices(model.nv, -1)
 
     def at(self, q: Array) -> Numeric:
         """Set the configuration to ``q``, shape (nq,)."""
@@ -101,12 +98,6 @@ def reduced(P: Array, M: Array, *jacobians: Array) -> tuple[Array, ...]:
     if not ignored.any():
         return M, *jacobians
     return P.T @ M @ P + np.diag(ignored.astype(float)), *(J @ P for J in jacobians)
-
-
-@cache
-def _below_diagonal(size: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the indices below the diagonal of a square matrix; cached, because NumPy computes them slowly."""
-    return np.tril_indices(size, -1)
 
 
 def _cross(a: Array, b: Array) -> Array:

@@ -159,12 +159,7 @@ def _load(means: Mapping[str, float], joint: Document | None) -> ImpactLoad:
     return ImpactLoad(*base, worst or None, means["impulse"], means["peak_force"], means["peak_jump"])
 
 
-def value_of(document: Document, quantity: str) -> float:
-    """Return the value of a metric in the document of a job."""
-    return float(_value(document, quantity))
-
-
-def _value(document: Document, quantity: str) -> Any:
+def value_of(document: Document, quantity: str) -> Any:
     """Return the value of a metric in the document of a job, or ``None`` if the robot has no such quantity."""
     metrics = document["metrics"]
     for key, table in (("saturation_", metrics["saturation_s"]), ("joint_", metrics["joint"] or {})):
@@ -203,7 +198,7 @@ def row_of(
         return ratio and replace(ratio, mean=1 - ratio.mean)
 
     compared = [*good, *(n for _, n in pairs if n["status"] == "completed")]
-    known = [name for name in QUANTITIES if all(_value(d, name) is not None for d in compared)]
+    known = [name for name in QUANTITIES if all(value_of(d, name) is not None for d in compared)]
     joint = worst_joint([WorstJoint(**d["metrics"]["joint"]) for d in good if d["metrics"]["joint"]])
     pushed = any(d["prediction"]["coulomb"] is None for d in good)
     return ControllerRow(

@@ -80,13 +80,11 @@ def read_record(folder: Path) -> dict[str, Any] | None:
     return content if sound else None
 
 
-def foreign_files(folder: Path) -> list[str]:
-    """Return the files and folders in a folder that no record in the folder lists, sorted."""
-    return _foreign(folder, set())
+def foreign_files(folder: Path, ours: frozenset[str] = frozenset(), below: str = "") -> list[str]:
+    """Return the files and folders in a folder that neither ``ours`` nor a record in the folder lists, sorted.
 
-
-def _foreign(folder: Path, ours: set[str], below: str = "") -> list[str]:
-    """Return the names in a folder that are neither in ``ours`` nor in the record of the folder, sorted."""
+    ``below`` is the path of the folder in the names of ``ours`` and of the result.
+    """
     content = read_record(folder)
     names = [] if content is None else [RECORD, *content["files"], *content["products"]]
     ours = ours.union(below + name for name in names)
@@ -95,7 +93,7 @@ def _foreign(folder: Path, ours: set[str], below: str = "") -> list[str]:
         name = below + entry.name
         if entry.is_dir(follow_symlinks=False):
             inside = any(path.startswith(f"{name}/") for path in ours) and not os.path.ismount(entry.path)
-            foreign += _foreign(Path(entry.path), ours, f"{name}/") if inside else [f"{name}/"]
+            foreign += foreign_files(Path(entry.path), ours, f"{name}/") if inside else [f"{name}/"]
         elif name not in ours or not entry.is_file(follow_symlinks=False):
             foreign.append(name)
     return foreign

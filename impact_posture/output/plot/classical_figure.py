@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from impact_posture.output.plot.ellipsoid_figure import draw_normals, normal_label, normals, square_panel
-from impact_posture.output.plot.ellipsoid_shapes import COORDINATE_PLANES, Plane, polar, shadow
+from impact_posture.output.plot.ellipsoid_shapes import COORDINATE_PLANES, Plane, longest, polar, shadow
 from impact_posture.output.plot.result_view import ResultView, header_lines, jump_unit, number
 from impact_posture.output.plot.style import BLUE, GREEN, INK, VERMILLION, framed, shared_legend
 from impact_posture.system.arrays import Array
@@ -73,7 +73,7 @@ def kinds_of(view: ResultView) -> list[Kind]:
         ("impact", "Λ$_c$", f"{jump_unit(view)}/(N·s)", impact, False),
     ):
         finite = [polar(matrix, 0.0)[0] if dual else matrix for matrix in matrices]
-        scale = _longest(finite[0]) or _longest(finite[1]) or 1.0
+        scale = longest(finite[0]) or longest(finite[1]) or 1.0
         cut = [polar(matrix, _ENDLESS * scale) if dual else (matrix, bounded) for matrix in matrices]
         drawn = [matrix / scale**2 for matrix, _ in cut]
         shown = [matrix / scale**2 for matrix in finite]
@@ -88,7 +88,7 @@ def classical_figure(view: ResultView) -> Figure:
     different units.  If ``JJᵀ`` is singular, the force ellipsoid is unbounded, and its panel states this.
     """
     kinds = kinds_of(view)
-    limit = 1.18 * max(1.0, *(_longest(matrix) for kind in kinds for matrix in kind.finite))
+    limit = 1.18 * max(1.0, *(longest(matrix) for kind in kinds for matrix in kind.finite))
     named = normals(view.before, view.after)
     with framed(*header_lines(view), 5.2, NOTES) as (figure, body):
         panels = body.subplots(2, 3)
@@ -106,10 +106,6 @@ def classical_figure(view: ResultView) -> Figure:
         handles.append(Line2D([], [], label=normal_label(named).split(", out")[0], color=INK, linewidth=1.1))
         shared_legend(body, handles, "upper")
     return figure
-
-
-def _longest(matrix: Array) -> float:
-    return float(np.sqrt(max(float(np.linalg.eigvalsh(matrix)[-1]), 0.0)))
 
 
 def _unbounded(plane: Plane, kind: Kind, which: int) -> str:

@@ -18,6 +18,7 @@ from impact_posture.output.plot.ellipsoid_shapes import (
     cone_rim,
     cone_shadow,
     half_width,
+    longest,
     principal_sections,
     shadow,
     square,
@@ -76,7 +77,7 @@ def ellipsoid_figure(view: ResultView) -> Figure:
     for word, free, line in zip(("before", "after"), view.free, (FREE_BEFORE, FREE_AFTER), strict=False):
         states.append(_State(f"{word}, free", free, line, free=True))
     unit = f"{jump_unit(view)}/(N·s)"
-    limit = common_limit([state.at.ellipsoid for state in states])
+    limit = 1.18 * max(longest(state.at.ellipsoid) for state in states) or 1.0
     n = view.after.normal
     notes = [*NOTES, *([_FREE] if view.objective.supports else []), *([_CONE] if _cones(view) else [])]
     with framed(*header_lines(view), 5.8, notes) as (figure, body):
@@ -94,12 +95,6 @@ def ellipsoid_figure(view: ResultView) -> Figure:
         draw_uncertainty_3d(space, view, limit)
         _legend(body.add_subplot(grid[1, 2]), states, unit, view)
     return figure
-
-
-def common_limit(matrices: list[Array]) -> float:
-    """Return half the side of a cube that contains all ellipsoids with a margin; 1 if all ellipsoids are points."""
-    widest = max(float(np.linalg.eigvalsh(matrix)[-1]) for matrix in matrices)
-    return 1.18 * float(np.sqrt(widest)) if widest > 0 else 1.0
 
 
 def square_panel(axes: Any, plane: Plane, limit: float, unit: str) -> None:

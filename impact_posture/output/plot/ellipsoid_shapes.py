@@ -69,6 +69,11 @@ def half_width(matrix: Array, direction: Array) -> float:
     return float(np.sqrt(max(float(direction @ matrix @ direction), 0.0)))
 
 
+def longest(matrix: Array) -> float:
+    """Return the longest semi-axis of ``{x: xᵀΛ⁻¹x ≤ 1}``."""
+    return float(np.sqrt(max(float(np.linalg.eigvalsh(matrix)[-1]), 0.0)))
+
+
 def shadow(matrix: Array, axes: Array, points: int = 181) -> Array:
     """Return the edge of the projection of ``{x: xᵀΛ⁻¹x ≤ 1}`` onto the plane of ``axes``, shape (2, points).
 
@@ -85,8 +90,8 @@ def surface(matrix: Array, rings: int = 25) -> Array:
     return np.asarray(np.einsum("ij,jkl->ikl", root(matrix), sphere))
 
 
-def principal_sections(matrix: Array, points: int = 121) -> list[Array]:
-    """Return the sections of an ellipsoid through pairs of principal axes, shape (3, points) each.
+def principal_sections(matrix: Array) -> list[Array]:
+    """Return the sections of an ellipsoid through pairs of principal axes, shape (3, 121) each.
 
     Sections that are points are left out.
     """
@@ -95,7 +100,7 @@ def principal_sections(matrix: Array, points: int = 121) -> list[Array]:
     pairs = [pair for pair in ([0, 1], [0, 2], [1, 2]) if np.linalg.norm(axes[:, pair[1]]) > flat]
     # If the ellipsoid is a segment, two of its sections are the same segment.
     pairs = pairs[1:] if len(pairs) == 2 and np.linalg.norm(axes[:, 1]) <= flat else pairs
-    return [_ring(axes[:, pair], points) for pair in pairs]
+    return [_ring(axes[:, pair], 121) for pair in pairs]
 
 
 def _semi_axes(matrix: Array) -> Array:
