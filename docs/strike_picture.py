@@ -27,11 +27,11 @@ IMAGES = Path(__file__).parent / "images"
 SCENARIO = "aerial-vertical"
 # Time before the approach, s.
 SETTLE = 2.5
-# Number of drawn postures.  They have equal distances on the path of the base and the joints.
+# Number of drawn postures.  The distances between these postures, along the path of base and joints, are equal.
 POSTURES = 5
 # Time from the contact to the last posture, s.
 AFTER = 0.1
-# The speed is drawn from before to after the contact, s.
+# Time interval, relative to the contact, in which the speed is drawn, s.
 SPAN = (-0.45, 0.15)
 
 

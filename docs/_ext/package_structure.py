@@ -45,7 +45,8 @@ def imports_of(path: Path) -> set[str]:
 
 
 def parts() -> dict[str, tuple[int, int, set[str]]]:
-    """Return number of files, number of lines, and imports of each part.  The largest part comes first."""
+    """Return the number of files, the number of lines, and the imports of each part.  The largest part comes
+    first."""
     counts: dict[str, tuple[int, int, set[str]]] = {}
     for package, folder in PACKAGES.items():
         for path in sorted(p for p in folder.rglob("*") if p.suffix in SUFFIXES):

@@ -63,10 +63,10 @@ STUDIES = {
     study.name: study
     for study in (
         Study("solve", "solve", "solve and build times, and the exported gradient with feet; random starts", 20),
-        Study("answer", "answer", "time of optimize until answer and end, beside another program", 5, page=False),
+        Study("answer", "answer", "time of optimize until answer and end, and of another program", 5, page=False),
         Study("formulations", "formulations", "the linear solve inside the program or its objective", 12, page=False),
-        Study("kernel", "kernel.times", "H and ∇H beside Pinocchio C++, ADAM and CasADi; passes", 101),
-        Study("gpu", "gpu.study", "H and ∇H on a GPU beside all cores, PyTorch and frax"),
+        Study("kernel", "kernel.times", "H and ∇H: our code, Pinocchio C++, ADAM and CasADi; passes", 101),
+        Study("gpu", "gpu.study", "H and ∇H on a GPU, on all cores, in PyTorch and in frax"),
         Study("loader", "exported:loader", "a call of exported code from Python; passes", 100, page=False),
         Study("tsid", "tsid", "a tick of the online controllers; ticks", 2000),
         Study("relaxed", "relaxed", "relaxed ticks in C of pushed robots; budget of iterations", 100, page=False),
@@ -76,7 +76,7 @@ STUDIES = {
         Study("feasible", "feasible", "what feasibility costs; seeds", 3, target="study-feasible"),
         Study("approach", "approach", "speed at which robots arrive in their optima", target="study-feasible"),
         Study("restitution", "restitution", "rebound of each contact law", target="calibration"),
-        Study("impacts", "impact.page", "objectives against impacts in MuJoCo; postures", 30, target="study-impacts"),
+        Study("impacts", "impact.page", "objectives, and impacts in MuJoCo; postures", 30, target="study-impacts"),
         Study("elastic", "elastic.study", "arms with elastic joints in MuJoCo; postures", 20, target="study-elastic"),
         Study("hits", "hits.study", "recorded hits of an iiwa 7, predicted; resamples", 200, target="study-hits"),
         Study("global", "global_search:maps", "self-motions and their bounds; seeds", 10, target="study-global"),
@@ -92,7 +92,7 @@ STUDIES = {
         Study(
             "verdict",
             "verdict.page",
-            "numbers of the verdict against simulated impacts; starts",
+            "numbers of the verdict, compared with simulated impacts; starts",
             4,
             target="study-verdict",
         ),

@@ -81,7 +81,8 @@ def predicted(factory: ControllerFactory, name: str) -> dict[str, float | None]:
 
 
 def result(scenario: str, name: str) -> dict[str, Any]:
-    """Return prediction and run of a controller.  The result is stored under a hash of scenario, robot and code."""
+    """Return the prediction and the run of a controller.  The result is stored under a hash of scenario, robot and
+    code."""
     shipped = scenario.split()[0]
     key = key_of(Job(shipped, name, 0, compile="auto"))[:12]
 

@@ -54,7 +54,7 @@ _HEAD = ("model", "joints", "contact", "start", "normal", "objective", "optimum"
 
 
 def sources() -> dict[str, str]:
-    """Return name → path or URI of the models at hand.
+    """Return the available models: name → path or URI.
 
     These are example-robot-data, the packages of robots that are installed, and the robots of MuJoCo Menagerie that
     are already downloaded, or all of them if ``MENAGERIE_ROOT`` is a clone.

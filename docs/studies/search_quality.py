@@ -1,4 +1,5 @@
-"""How often the default search reaches the best known posture, and its time, beside multi-start with 16 starts.
+"""How often the default search reaches the best known posture, and its time, compared with multi-start from 16
+starts.
 
 The cases are random serial arms whose contact point keeps its place.  A study without a page takes all robots of the
 catalogue instead, above a floor and in front of a wall.  The best known objectives are kept in the cache folder: each

@@ -1,4 +1,4 @@
-"""Simulate planned strikes beside strikes from the nominal posture and with the reference flow.
+"""Simulate planned strikes, and compare them with strikes from the nominal posture and with the reference flow.
 
 A seed varies the speed, and the tilt and the place of the surface, which the controllers do not know.  Finished runs
 are stored in build/strikes.

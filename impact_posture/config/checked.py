@@ -1,4 +1,4 @@
-"""Check the arguments of a Python call against the annotations of the called function.
+"""Check whether the arguments of a Python call agree with the annotations of the called function.
 
 The function ``validate_call`` of Pydantic accepts text as a number, and rejects a NumPy array as a sequence.  Users
 of this package pass arrays, so this module has its own check.

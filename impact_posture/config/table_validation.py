@@ -1,4 +1,4 @@
-"""Read TOML files, and validate their tables against dataclasses, with suggestions for misspelt keys."""
+"""Read TOML files, and check whether their tables fit dataclasses, with suggestions for misspelt keys."""
 
 from __future__ import annotations
 

@@ -102,7 +102,7 @@ def draft_spec(located: Located, options: LoadOptions, folder: Path) -> Draft:
             f"Data of {robot.name} that its {_file(robot, 'URDF')} cannot hold, drafted by impact-posture inspect "
             "--write-robot-toml. "
             "GUESS marks values from names and geometry alone: check them before you trust a result. This file is "
-            "read as robot.toml beside that file, else by --config."
+            "read as robot.toml in the folder of that file, or by --config."
         )
     )
     draft.lines.append(f'schema = "{SCHEMA}"')

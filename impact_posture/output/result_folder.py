@@ -63,7 +63,8 @@ def finish_result(
     """
     export = partial(_export, folder, prepared, postures) if codegen else partial(Written, folder)
     scene: ReportScene | None = None
-    # The C code takes longest.  Another process therefore starts to write it before this process imports matplotlib.
+    # The C code takes longest.  Another process therefore starts to write this code before this process imports
+    # matplotlib.
     with fork_call(export) if codegen and jobs > 1 else nullcontext(export) as exported:
         from impact_posture.output.plot import draw_all, drawable
         from impact_posture.output.report.result_report import result_scene, write_result_report
@@ -73,8 +74,8 @@ def finish_result(
         count = len(names) + codegen + report
         with fork_map(lambda k: draw_all(view, folder, formats, [names[k]]), len(names), jobs) as results:
             if report:
-                # The main process prepares the scene while it waits for the workers.  An error here occurs again
-                # when the report is written, and is reported then.
+                # The main process prepares the scene while it waits for the workers.  An error here is ignored,
+                # because it occurs again when the report is written, and is reported then.
                 with suppress(Exception):
                     scene = result_scene(prepared, view, meshes)
                     _ = scene.packed

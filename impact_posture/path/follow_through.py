@@ -54,8 +54,8 @@ class FollowThrough:
     """The stop after the predicted impact, and the least distances along the stops after all considered impacts.
 
     Attributes:
-        velocity: Predicted generalized velocity after the impact, ``ν + Δν``, shape (nv,).  It is ``ν`` if no impulse
-            is known.
+        velocity: Predicted generalized velocity after the impact, ``ν + Δν``, shape (nv,); ``ν`` if no impulse is
+            known.
         rows: The motion from this velocity to rest; ``None`` if it does not exist.
         impacts: Number of considered impacts: the predicted impact, and all combinations of a restitution in
             :data:`RESTITUTIONS`, a factor on the velocity in :data:`FACTORS`, and a normal (also on the edge of the

@@ -47,7 +47,7 @@ class PathReference:
     Attributes:
         path: The path.
         approach: Speed of the contact point towards the surface per generalized velocity, shape (nv,), at the end of
-            the path; zeros if the contact is not known, and the second event then never occurs.
+            the path.  If the contact is not known, the entries are zero, and the second event never occurs.
         late: Longest time for which the references continue after the expected contact, s.
         felt: Force above which a contact is felt, N.
         stopped: The contact is noticed if the contact point has less than this share of its planned speed.

@@ -83,7 +83,8 @@ def _room(space: PathSpace, q: Array) -> tuple[Array, Array, Array]:
     """Return rows ``g``, shape (m, nv), and distances, shape (m,), such that a step ``δ`` needs ``gᵀδ ≤`` distance.
 
     A row is the gradient of an inequality or joint limit.  Also return whether a motion can come from the inside of
-    the bound, shape (m,).  It cannot for a joint that does not move, and for a bound on a robot at rest.
+    the bound, shape (m,).  No motion can come from there for a joint that does not move, or for a bound on a robot at
+    rest.
     """
     model, problem = space.projector.numeric.at(q), space.problem
     limits = linearized_limits(problem, q)

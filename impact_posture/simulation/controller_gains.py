@@ -90,7 +90,7 @@ class Control(StrictTable):
         robust: Gain and activation of the impact-robust term.
         period: Duration of a tick, s, at most an hour.
         tilt: Gains of the task that keeps the base level (first priority).
-        end_effector: Gains of the end effector task (second priority); the rows of the position come first.
+        end_effector: Gains of the end effector task (second priority); its first rows belong to the position.
         apparent_mass: Mass M_d, kg.  A measured force F̂ adds ``F̂/M_d`` to the acceleration of the end effector
             task; with ``None``, the task ignores the force.
         center_of_mass: Gains of the center of mass task.

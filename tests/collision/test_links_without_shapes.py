@@ -21,7 +21,7 @@ BARE = "links without shapes: mast, jib; "
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A planar arm that touches a wall, beside a boom of two links without shapes, which can swing into the wall."""
+    """A planar arm that touches a wall, next to a boom of two links without shapes, which can swing into the wall."""
     shutil.copy(TWINBOOM, tmp_path)
     (tmp_path / "robot.toml").write_text(f'default_posture = "bent"\n[postures.bent]\njoints = {BENT}\n')
     return tmp_path

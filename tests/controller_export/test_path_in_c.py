@@ -80,7 +80,8 @@ def phases(
 ) -> dict[int, PathPhase]:
     """Make the same calls of Python and C at the same ticks, and compare the references of all ticks.
 
-    The robot is beside its reference and has 30 % of its velocity.  Return the ticks at which a phase begins.
+    The robot is not at its reference, and has 30 % of the velocity of the reference.  Return the ticks at which a
+    phase begins.
     """
     python, c, begun = reference_of(name, strikes), PathInC(name, strikes), dict[int, PathPhase]()
     python.reset()

@@ -96,7 +96,7 @@ def test_overflows_in_a_program_are_not_printed(arena: Path) -> None:
 @pytest.mark.parametrize("most", [4, 5])
 @pytest.mark.parametrize("command", ["evaluate", "optimize"])
 def test_few_open_files(command: str, most: int, arena: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With four files, one file can be open beside standard input, output and error."""
+    """With a limit of four files, only one file can be open in addition to standard input, output and error."""
 
     def limited(*arguments: object) -> int:
         os.closerange(3, 1 << 10)

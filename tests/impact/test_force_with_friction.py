@@ -1,4 +1,4 @@
-"""Peak force, compression time and effective mass with friction, against an integrated contact; their gradients."""
+"""Peak force, compression time and effective mass with friction, compared with an integrated contact; gradients."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``H, G, V, S, E, Λ_c``, their gradients and lifted form, by three methods: symbolic, Pinocchio, differences."""
+"""``H, G, V, S, E, Λ_c``, gradients and lifted form, by three methods: symbolic, Pinocchio, finite differences."""
 
 from __future__ import annotations
 

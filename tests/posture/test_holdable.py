@@ -1,4 +1,4 @@
-"""Forces that hold a posture, against independent statics and linear programs, and in optimized postures."""
+"""Forces that hold a posture, compared with independent statics and linear programs, and in optimized postures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The trade-off of objective against distance: against brute force, its certificates, and its warnings."""
+"""The trade-off between objective and distance: compared with brute force, its certificates, and its warnings."""
 
 from __future__ import annotations
 

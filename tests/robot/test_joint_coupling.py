@@ -1,4 +1,4 @@
-"""Coupled joints (``<mimic>``): how they are read, and their dynamics against Pinocchio's own mimic joints."""
+"""Coupled joints (``<mimic>``): how they are read, and their dynamics, compared with mimic joints of Pinocchio."""
 
 from __future__ import annotations
 

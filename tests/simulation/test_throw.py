@@ -39,7 +39,7 @@ def thrown(name: str, direction: tuple[float, float, float] = (-1, 0, 0)) -> Set
 
 
 def ball(world: World) -> tuple[Vector, Vector]:
-    """Return position and velocity of the ball, which belong to the last joint."""
+    """Return the position and the velocity of the ball, which belong to the last joint."""
     return world._data.qpos[-7:-4].copy(), world._data.qvel[-6:-3].copy()
 
 

@@ -1,4 +1,4 @@
-"""The study of robot models at hand: answers, refusals with their reason, and faults."""
+"""The study of the available robot models: answers, refusals with their reason, and faults."""
 
 from __future__ import annotations
 

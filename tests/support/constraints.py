@@ -18,7 +18,7 @@ from tests.support.helpers import Vector, assert_close, central_gradient, rng
 def check_expression(
     constraint: ExpressionConstraint, model: pin.Model, postures: Iterable[Vector], turns: slice = slice(0)
 ) -> None:
-    """Check value and Jacobian of ``c(q)``.
+    """Check the value and the Jacobian of ``c(q)``.
 
     The rows ``turns`` belong to a quaternion, so the check also accepts them with the opposite sign.
     """

@@ -1,1 +1,1 @@
-"""H and ∇H on a GPU, beside the same functions on all cores and other packages."""
+"""Times of H and ∇H on a GPU, compared with the same functions on all cores and with other packages."""

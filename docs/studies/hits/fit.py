@@ -98,7 +98,7 @@ def _integral(values: Vector) -> Vector:
 
 
 def fit_rotors(hits: Sequence[Hit]) -> Vector:
-    """Return the inertia of the rotors, kg·m², shape (7,): least squares of positions against measured torques."""
+    """Return the inertia of the rotors, kg·m², shape (7,), from positions and measured torques by least squares."""
     lost, _, moved = (np.vstack(values) for values in zip(*(rotor_columns(hit) for hit in hits), strict=True))
     return np.asarray(-np.sum(lost**2, axis=0) / np.sum(lost * moved, axis=0))
 

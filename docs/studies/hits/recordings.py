@@ -97,7 +97,7 @@ class Hit:
         return moved if moved.contact + AVERAGED[self.group.box][1] < len(self.q) else None
 
     def trend(self) -> tuple[Vector, Vector]:
-        """Return velocity (rad/s) in the last row before the contact and acceleration (rad/s²), shapes (7,).
+        """Return the velocity (rad/s) in the last row before the contact, and the acceleration (rad/s²), shapes (7,).
 
         A straight line is fitted to the velocities before the contact.  If the rows are few, the recorded velocity of
         the first row replaces earlier rows.

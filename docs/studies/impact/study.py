@@ -38,7 +38,7 @@ STUDIED: dict[str, tuple[Case, str, str]] = {
 # Friction coefficients of a surface without friction, of ice, of two ordinary surfaces, and of a surface on which
 # nothing slides.
 FRICTIONS = (0.0, 0.1, 0.3, 0.8, np.inf)
-# Other variations of an impact: description, and surface; the friction is set later.
+# Other variations of an impact, each with a description and a surface; the friction is set later.
 VARIATIONS = (
     ("0.1 m/s", Surface(speed=0.1)),
     ("3 m/s", Surface(speed=3.0)),

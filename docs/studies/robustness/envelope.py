@@ -133,8 +133,8 @@ def _overview(name: str, own: Sequence[Record], controller: str) -> list[str]:
 
 
 def _explained() -> Iterator[str]:
-    yield "Change of the motion in the window / over the second, against nominal at the same point. **Bold**: all"
-    yield "targets are met. *Nominal*: motion of the nominal controller in the window."
+    yield "Change of the motion in the window / over the second, compared with nominal at the same point. **Bold**:"
+    yield "all targets are met. *Nominal*: motion of the nominal controller in the window."
 
 
 def _variations(own: Sequence[Record]) -> Iterator[str]:

@@ -157,7 +157,7 @@ def _factory(setup: Setup) -> ControllerFactory:
 
 
 def _offline(setup: Setup, objective: WorstCaseObjective, **options: Any) -> OfflinePosture:
-    """Return the offline posture.  Points that differ in gains, pushes or contact laws share it."""
+    """Return the offline posture.  Points that differ only in gains, pushes or contact laws have the same posture."""
     demands = scenario_requirements(setup, objective, at_contact=options["at_contact"])
     impact = objective.contact, objective.metric, objective.kind, objective.supports, objective.compliance
     key = repr((setup.robot.source, setup.robot.data_sha256, setup.q.tobytes(), impact, demands, options))

@@ -188,7 +188,7 @@ def _splits(records: Records) -> Iterator[str]:
                 about = words.get(key, f"shoulder less than {_UNDER:g} m from under the center")
                 body.append([f"`{name}`", about, f"`{controller}`", _part(so), _part(otherwise)])
     if any(not r.draw.name for own in records.values() for r in own):
-        yield from ("In how many random draws the motion is less, and its median change:", "")
+        yield from ("Number of random draws with less motion, and the median change of the motion:", "")
         yield from table(["scenario", "split", "controller", "so", "otherwise"], body)
 
 

@@ -1,1 +1,1 @@
-"""Check the numbers of the verdict against a small simulation of the impact."""
+"""Compare the numbers of the verdict with a small simulation of the impact."""

@@ -201,7 +201,7 @@ class ImpactSimulation:
         return M, J[: 3 * count], J[3:] if self.held else None
 
     def _dynamics(self, q: Vector) -> tuple[Vector, Vector]:
-        """Return mass matrix, and linear Jacobian of all points in world axes."""
+        """Return the mass matrix, and the linear Jacobian of all points in world axes."""
         M = np.array(pin.crba(self.model, self._data, q))
         pin.computeJointJacobians(self.model, self._data, q)
         placed = [(point.joint, pin.SE3(np.eye(3), point.position)) for point in self.points]

@@ -142,7 +142,7 @@ def _tangents(axes: Any, plane: Plane, state: _State, limit: float) -> None:
 
 
 def normals(before: ImpactQuantities, after: ImpactQuantities) -> list[tuple[str, Array]]:
-    """Return name and direction of n; two normals if n is fixed to the contact frame and turns with it."""
+    """Return the name and the direction of n; two normals if n turns with the contact frame."""
     if np.linalg.norm(before.normal - after.normal) < 1e-3:
         return [("n", after.normal)]
     return [("n₀", before.normal), ("n₁", after.normal)]

@@ -38,7 +38,7 @@ _BEFORE = 0.005
 
 
 def instants(view: RunView) -> list[tuple[str, float]]:
-    """Return name and time (s) of three snapshots: start, just before the first impact, and end of its window.
+    """Return the names and times (s) of three snapshots: start, just before the first impact, and end of its window.
 
     Without an impact, the snapshots are at the start, the middle and the end of the run.
     """

@@ -159,7 +159,7 @@ def _set_physics(spec: Any, physics: Physics) -> None:
 
 
 def _set_passive(mjcf: Mjcf, robot: Robot) -> None:
-    """Give the joints damping, friction loss and springs of the MJCF from which the robot was loaded."""
+    """Give the joints the damping, friction loss and springs of the MJCF from which the robot was loaded."""
     if robot.mjcf is None:
         return
     source = robot.mjcf.model
