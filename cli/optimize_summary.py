@@ -46,6 +46,14 @@ def announce(page: Page, prepared: Prepared) -> None:
     page.gap()
 
 
+def _verdict_lines(verdict: dict[str, Any]) -> list[str]:
+    """Return the verdict with one line for each condition and each sentence; all but the first line are indented."""
+    text: str = verdict["line"].replace(". ", ".\n  ")
+    for condition in verdict["conditions"]:
+        text = text.replace(f"{condition['line']}; ", f"{condition['line']};\n  ")
+    return text.split("\n")
+
+
 def summarize(page: Page, prepared: Prepared, solution: PostureSolution, document: dict[str, Any]) -> None:
     """Print the result: verdict, table of values at the start and at the optimum, certificate, trade-off and path."""
     from impact_posture.output.quantity_table import HEAD, answer_key, quantity_rows
@@ -53,7 +61,8 @@ def summarize(page: Page, prepared: Prepared, solution: PostureSolution, documen
 
     initial, answer = document["initial"], document[answer_key(document)]
     impact, blocks = prepared.impact, dict(zip(HEAD[1:3], (initial, answer), strict=True))
-    page.line(document["verdict"]["line"], style="bold")
+    for line in _verdict_lines(document["verdict"]):
+        page.line(line, style="bold")
     page.line(document["verdict"]["minimized"])
     for line in document["verdict"]["advice"]:
         page.line(f"  {line}")

@@ -81,10 +81,13 @@ class Page:
         self.console.print(line)
 
     def line(self, text: str, *, style: str = "") -> None:
-        """Write a paragraph; long lines are wrapped between words."""
+        """Write a paragraph; long lines are wrapped between words, and all lines keep the indent of the first."""
+        from rich.padding import Padding
         from rich.text import Text
 
-        self.console.print(Text(printable(as_options(text)), style=style))
+        words = text.lstrip(" ")
+        paragraph, indent = Text(printable(as_options(words)), style=style), len(text) - len(words)
+        self.console.print(Padding(paragraph, (0, 0, 0, indent), expand=False) if indent else paragraph)
 
     def gap(self) -> None:
         """Write an empty line."""
