@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import casadi as ca
@@ -24,9 +26,11 @@ from impact_posture.posture.search.growing_search import run_start
 from impact_posture.posture.search.multistart import PostureSolution, solve
 from impact_posture.posture.search.screening import screen, screenable
 from impact_posture.posture.search.unseen_optima import SAME_VALUE, SearchEstimate, hits_by_value
+from impact_posture.system import toolchain
 from tests.posture.test_self_motion import drawn
 from tests.support.command import run
 from tests.support.settings import make_settings
+from tests.support.tools import need_compiler
 
 
 def descended(manifold: ConstraintManifold, x: np.ndarray) -> Ends:
@@ -45,15 +49,50 @@ def descended(manifold: ConstraintManifold, x: np.ndarray) -> Ends:
     "name",
     ["tilthex_arm, cone 20°", "solo8, four feet, cone 20°", "solo12, two feet struck", "tilthex_arm, 6 models"],
 )
-def test_a_batch_equals_single_calls(name: str) -> None:
+def test_a_batch_equals_single_calls(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     manifold = ConstraintManifold(CASES[name].problem())
     # Two full runs of the operations, and a third with one posture.
     x = drawn(manifold, 2 * batch_function._WIDTH + 1, 0)
-    for function in (manifold._objective, manifold._equalities):
-        assert function._operations is not None
-        for together, alone in zip(function(x), function._one_by_one((x,)), strict=True):
-            scale = np.nanmax(np.abs(alone), initial=1.0)
-            np.testing.assert_allclose(together, alone, rtol=1e-9, atol=1e-12 * scale)
+    for loop in (batch_function._compiled_loop(), None):
+        monkeypatch.setattr(batch_function, "_compiled_loop", lambda loop=loop: loop)
+        for function in (manifold._objective, manifold._equalities):
+            assert function._operations is not None
+            for together, alone in zip(function(x), function._one_by_one((x,)), strict=True):
+                scale = np.nanmax(np.abs(alone), initial=1.0)
+                np.testing.assert_allclose(together, alone, rtol=1e-9, atol=1e-12 * scale)
+
+
+def test_operations_in_c_equal_the_operations_of_numpy(monkeypatch: pytest.MonkeyPatch) -> None:
+    need_compiler()
+    assert batch_function._compiled_loop() is not None
+    x, codes = ca.SX.sym("x", 2), [*batch_function._OPERATIONS]
+    results = [
+        ca.SX.binary(code, x[0], x[1]) if "b" in re.findall(r"\w+", formula) else ca.SX.unary(code, x[0])
+        for code, (_, formula) in batch_function._OPERATIONS.items()
+    ]
+    function = BatchFunction([x], [ca.vertcat(*results)])
+    assert {*codes} - {code for code, *_ in function._operations or ()} <= {ca.OP_ASSIGN, ca.OP_CONSTPOW}
+    special = [-np.inf, -2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0, np.inf, np.nan]
+    values = np.concatenate([np.random.default_rng(0).normal(size=(100, 2)), [*product(special, special)]])
+    in_c = function(values)[0]
+    monkeypatch.setattr(batch_function, "_compiled_loop", lambda: None)
+    for k, by_numpy in enumerate(function(values)[0].swapaxes(0, 1)):
+        np.testing.assert_allclose(in_c[:, k], by_numpy, rtol=1e-14, err_msg=results[k].str())
+
+
+def test_without_a_compiler_numpy_evaluates_batches(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    need_compiler()
+    monkeypatch.setenv("IMPACT_POSTURE_CACHE", str(tmp_path))
+    monkeypatch.setattr(batch_function, "_compiled_loop", batch_function._compiled_loop.__wrapped__)
+    assert batch_function._compiled_loop() is not None
+    monkeypatch.setattr(toolchain, "find_compiler", lambda: None)
+    # The cached library needs no compiler.
+    assert batch_function._compiled_loop() is not None
+    monkeypatch.setenv("IMPACT_POSTURE_CACHE", str(tmp_path / "empty"))
+    assert batch_function._compiled_loop() is None
+    x = ca.SX.sym("x")
+    values = np.linspace(-1, 1, 80)[:, None]
+    np.testing.assert_array_equal(BatchFunction([x], [x * x])(values)[0][:, :, 0], values**2)
 
 
 def test_a_batch_of_a_function_that_numpy_lacks_is_still_right() -> None:

@@ -4,7 +4,7 @@ Each step is the sum of a quasi-Newton step (BFGS) in the tangent space of the e
 that returns to the equalities.  Postures that violate the equalities are compared by the Lagrangian ``m − λᵀc``, with
 the merit m, the equalities c and the least-squares multipliers λ.  To first order, the Lagrangian is the merit after
 the return to the equalities, so a step needs a single evaluation.  The batch stays full, because a new descent can
-begin when another ends.  For an arm, a descent takes about 0.5 ms, and a run of IPOPT about 10 ms.  Clearances and
+begin when another ends.  For an arm, a descent takes about 0.3 ms, and a run of IPOPT about 10 ms.  Clearances and
 loads have no batch function, so descents ignore them.
 """
 

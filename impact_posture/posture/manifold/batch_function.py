@@ -1,22 +1,31 @@
 """Evaluate a CasADi function at many postures at once.
 
-CasADi evaluates one posture after another.  For a batch, NumPy runs each operation of the function on all postures
-together.  For 512 postures, this takes about a sixth of the time.
+CasADi evaluates one posture after another.  For a batch, a loop in C runs each operation of the function on a block
+of postures.  For 512 postures, this takes about a twentieth of the time.  Without a compiler, NumPy runs each
+operation on all postures, in about an eighth of the time.  All three give equal results.
 """
 
 from __future__ import annotations
 
+import ctypes
+import platform
 from collections.abc import Callable
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
+from impact_posture.errors import CompilerError, OutputError, SpecError
 from impact_posture.system.arrays import Array
+from impact_posture.system.libraries import building, cache_folder, is_cached, load_library, source_key
+from impact_posture.system.toolchain import require_compiler, run_compiler
 
-# Number of postures that are evaluated together.  With fewer postures, the calls of NumPy take most of the time.
+# Number of postures that NumPy evaluates together.  With fewer postures, the calls of NumPy take most of the time.
 _WIDTH = 512
+# Number of postures in a block of the loop in C.  With fewer postures, selecting the code takes most of the time.
+_LANES = 64
 # Below this number of postures, CasADi is faster.
 _SMALL = 64
 
@@ -29,16 +38,77 @@ def _twice(value: Array, out: Array) -> None:
     np.add(value, value, out)
 
 
-_OPERATIONS: dict[int, Callable[..., Any]] = {
-    ca.OP_ASSIGN: np.positive, ca.OP_ADD: np.add, ca.OP_SUB: np.subtract, ca.OP_MUL: np.multiply,
-    ca.OP_DIV: np.divide, ca.OP_NEG: np.negative, ca.OP_INV: np.reciprocal, ca.OP_SQ: np.square,
-    ca.OP_TWICE: _twice, ca.OP_SQRT: np.sqrt, ca.OP_POW: np.power, ca.OP_CONSTPOW: np.power, ca.OP_EXP: np.exp,
-    ca.OP_LOG: np.log, ca.OP_SIN: np.sin, ca.OP_COS: np.cos, ca.OP_TAN: np.tan, ca.OP_ASIN: np.arcsin,
-    ca.OP_ACOS: np.arccos, ca.OP_ATAN: np.arctan, ca.OP_ATAN2: np.arctan2, ca.OP_HYPOT: np.hypot,
-    ca.OP_FABS: np.absolute, ca.OP_SIGN: np.sign, ca.OP_FMIN: np.fmin, ca.OP_FMAX: np.fmax, ca.OP_LT: np.less,
-    ca.OP_LE: np.less_equal, ca.OP_EQ: np.equal, ca.OP_NE: np.not_equal, ca.OP_NOT: np.logical_not,
-    ca.OP_AND: np.logical_and, ca.OP_OR: np.logical_or, ca.OP_IF_ELSE_ZERO: _if_else_zero,
+# For each operation, the function of NumPy and the expression in C, whose arguments are a and b.
+_OPERATIONS: dict[int, tuple[Callable[..., Any], str]] = {
+    ca.OP_ASSIGN: (np.positive, "a"), ca.OP_ADD: (np.add, "a + b"), ca.OP_SUB: (np.subtract, "a - b"),
+    ca.OP_MUL: (np.multiply, "a * b"), ca.OP_DIV: (np.divide, "a / b"), ca.OP_NEG: (np.negative, "-a"),
+    ca.OP_INV: (np.reciprocal, "1 / a"), ca.OP_SQ: (np.square, "a * a"), ca.OP_TWICE: (_twice, "a + a"),
+    ca.OP_SQRT: (np.sqrt, "sqrt(a)"), ca.OP_POW: (np.power, "pow(a, b)"), ca.OP_CONSTPOW: (np.power, "pow(a, b)"),
+    ca.OP_EXP: (np.exp, "exp(a)"), ca.OP_LOG: (np.log, "log(a)"), ca.OP_SIN: (np.sin, "sin(a)"),
+    ca.OP_COS: (np.cos, "cos(a)"), ca.OP_TAN: (np.tan, "tan(a)"), ca.OP_ASIN: (np.arcsin, "asin(a)"),
+    ca.OP_ACOS: (np.arccos, "acos(a)"), ca.OP_ATAN: (np.arctan, "atan(a)"), ca.OP_ATAN2: (np.arctan2, "atan2(a, b)"),
+    ca.OP_HYPOT: (np.hypot, "hypot(a, b)"), ca.OP_FABS: (np.absolute, "fabs(a)"),
+    ca.OP_SIGN: (np.sign, "a > 0 ? 1 : a < 0 ? -1 : a"), ca.OP_FMIN: (np.fmin, "fmin(a, b)"),
+    ca.OP_FMAX: (np.fmax, "fmax(a, b)"), ca.OP_LT: (np.less, "a < b"), ca.OP_LE: (np.less_equal, "a <= b"),
+    ca.OP_EQ: (np.equal, "a == b"), ca.OP_NE: (np.not_equal, "a != b"), ca.OP_NOT: (np.logical_not, "!a"),
+    ca.OP_AND: (np.logical_and, "a && b"), ca.OP_OR: (np.logical_or, "a || b"),
+    ca.OP_IF_ELSE_ZERO: (_if_else_zero, "a != 0 ? b : 0"),
 }  # fmt: skip
+
+# The loop in C.  An operation is four integers: code, two arguments and target.  Arguments and target are registers,
+# constants, or entries of the inputs x and the outputs y of a posture.
+_LOOP = """#include <math.h>
+#define REGISTER(n) (registers + LANES * o[n])
+void run(const int *operations, int count, const double *constants, const double *x, int nx, double *y, int ny,
+         int postures, double *registers)
+{
+    for (int first = 0; first < postures; first += LANES) {
+        const int width = postures - first < LANES ? postures - first : LANES;
+        for (const int *o = operations; o < operations + 4 * count; o += 4) {
+            switch (o[0]) {
+            case CONSTANT: for (int k = 0; k < LANES; ++k) REGISTER(3)[k] = constants[o[1]]; break;
+            case INPUT: for (int k = 0; k < width; ++k) REGISTER(3)[k] = x[(first + k) * nx + o[1]]; break;
+            case OUTPUT: for (int k = 0; k < width; ++k) y[(first + k) * ny + o[3]] = REGISTER(1)[k]; break;
+OPERATIONS
+            }
+        }
+    }
+}
+"""
+_OPERATION = """            case {}: {{
+                const double *u = REGISTER(1), *v = REGISTER(2);
+                double *w = REGISTER(3);
+                _Pragma("GCC ivdep") for (int k = 0; k < LANES; ++k) {{
+                    const double a = u[k], b = v[k];
+                    (void)b;
+                    w[k] = {};
+                }}
+                break;
+            }}"""
+
+
+@cache
+def _compiled_loop() -> Callable[..., None] | None:
+    """Return the loop in C, which is built once and cached; ``None`` if it cannot be built."""
+    cases = (_OPERATION.format(code, expression) for code, (_, expression) in _OPERATIONS.items())
+    source = _LOOP.replace("OPERATIONS", "\n".join(cases))
+    numbers = {"LANES": _LANES, "CONSTANT": ca.OP_CONST, "INPUT": ca.OP_INPUT, "OUTPUT": ca.OP_OUTPUT}
+    # Without fused multiplications and additions, the results equal the results of NumPy.
+    flags = ["-O2", "-fPIC", "-ffp-contract=off", "-fno-math-errno", *(f"-D{k}={n}" for k, n in numbers.items())]
+    try:
+        library = cache_folder() / f"{source_key([source, *flags, platform.system(), platform.machine()])}.so"
+        if not is_cached(library):
+            compiler = require_compiler("search")
+            with building(library) as folder:
+                (folder / "batch.c").write_text(source, encoding="utf-8")
+                run_compiler([*compiler, *flags, "-shared", "batch.c", "-o", library.name, "-lm"], folder)
+        run = load_library(library).run
+    except (CompilerError, OutputError, SpecError):
+        return None
+    pointer, integer = ctypes.c_void_p, ctypes.c_int
+    run.argtypes = [pointer, integer, pointer, pointer, integer, pointer, integer, integer, pointer]
+    run.restype = None
+    return run
 
 
 class _Program(NamedTuple):
@@ -47,6 +117,14 @@ class _Program(NamedTuple):
     inputs: list[Array]
     outputs: list[Array]
     calls: list[tuple[Callable[..., Any], tuple[Array, ...]]]
+
+
+class _LoopProgram(NamedTuple):
+    """The operations of a function for the loop in C, shape (N, 4), with constants and registers."""
+
+    operations: NDArray[np.int32]
+    constants: Array
+    registers: Array
 
 
 class BatchFunction:
@@ -60,6 +138,8 @@ class BatchFunction:
         count = len(inputs[0])
         if count < _SMALL or self._operations is None:
             return self._one_by_one(inputs)
+        if (run := _compiled_loop()) is not None:
+            return self._in_blocks(run, np.concatenate(inputs, axis=1))
         parts = [self._together([x[k : k + _WIDTH] for x in inputs]) for k in range(0, count, _WIDTH)]
         return [np.concatenate(pieces) for pieces in zip(*parts, strict=True)]
 
@@ -71,6 +151,18 @@ class BatchFunction:
         return [
             np.asarray(value, dtype=float).reshape(shape[0], count, shape[1]).transpose(1, 0, 2)
             for value, shape in zip(outputs, self._shapes, strict=True)
+        ]
+
+    def _in_blocks(self, run: Callable[..., None], x: Array) -> list[Array]:
+        (operations, constants, registers), ends = self._loop_program, self._ends
+        x, y = np.ascontiguousarray(x, dtype=float), np.empty((len(x), ends[-1]))
+        run(
+            operations.ctypes.data, len(operations), constants.ctypes.data, x.ctypes.data, x.shape[1],
+            y.ctypes.data, y.shape[1], len(x), registers.ctypes.data,
+        )  # fmt: skip
+        return [
+            np.ascontiguousarray(piece).reshape(len(x), *shape)
+            for piece, shape in zip(np.split(y, ends[:-1], axis=1), self._shapes, strict=True)
         ]
 
     def _together(self, inputs: list[Array]) -> list[Array]:
@@ -96,6 +188,11 @@ class BatchFunction:
         return [output.shape for output in self._expressions[1]]
 
     @cached_property
+    def _ends(self) -> list[int]:
+        """For each output, the number of entries of this output and of the outputs before it."""
+        return [int(end) for end in np.cumsum([rows * columns for rows, columns in self._shapes])]
+
+    @cached_property
     def _operations(self) -> list[tuple[int, list[int], list[int], float]] | None:
         """Code, inputs, outputs and constant of each operation; ``None`` if NumPy lacks an operation."""
         function, operations = self._function, list[tuple[int, list[int], list[int], float]]()
@@ -106,6 +203,29 @@ class BatchFunction:
             constant = function.instruction_constant(k) if code == ca.OP_CONST else 0.0
             operations.append((code, function.instruction_input(k), function.instruction_output(k), constant))
         return operations
+
+    @cached_property
+    def _loop_program(self) -> _LoopProgram:
+        """The operations for the loop in C."""
+        function, operations = self._function, self._operations
+        assert operations is not None  # noqa: S101 (narrows a type)
+        before = np.cumsum([0, *(function.nnz_in(k) for k in range(function.n_in()))]).tolist()
+        rows, constants = list[tuple[int, int, int, int]](), list[float]()
+        for code, sources, targets, constant in operations:
+            if code == ca.OP_CONST:
+                rows.append((code, len(constants), 0, targets[0]))
+                constants.append(constant)
+            elif code == ca.OP_INPUT:
+                rows.append((code, before[sources[0]] + sources[1], 0, targets[0]))
+            elif code == ca.OP_OUTPUT:
+                # CasADi counts the entries by columns, NumPy by rows.
+                height, width = self._shapes[targets[0]]
+                column, row = divmod(targets[1], height)
+                rows.append((code, sources[0], 0, self._ends[targets[0]] - height * width + row * width + column))
+            else:
+                rows.append((code, sources[0], sources[-1], targets[0]))
+        registers = np.zeros((function.sz_w(), _LANES))
+        return _LoopProgram(np.array(rows, dtype=np.int32).reshape(-1, 4), np.array(constants), registers)
 
     @cached_property
     def _program(self) -> _Program:
@@ -127,5 +247,5 @@ class BatchFunction:
             else:
                 arguments, register = [at[source] for source in sources], targets[0]
                 at[register] = own[register]
-                calls.append((_OPERATIONS[code], (*arguments, own[register])))
+                calls.append((_OPERATIONS[code][0], (*arguments, own[register])))
         return _Program(inputs, outputs, calls)
