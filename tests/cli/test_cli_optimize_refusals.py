@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import resource
 import shutil
 import signal
 import subprocess
@@ -15,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.command import refused, run
+from tests.support.tools import files_of
 
 COMMAND = Path(sys.executable).parent / "impact-posture"
 FAST = ("--starts", "2", "--jobs", "1", "--no-codegen", "--format", "png")
@@ -117,10 +117,7 @@ def test_output_that_cannot_be_made(tmp_path: Path) -> None:
 
 
 def test_file_size_limit_leaves_nothing(tmp_path: Path) -> None:
-    def limit() -> None:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
-
-    refused(run(*BASE, "--out", "out", cwd=tmp_path, prepare=limit, pictures=("ellipsoid",)), 1, "out")
+    refused(run(*BASE, "--out", "out", cwd=tmp_path, prepare=files_of(20_000), pictures=("ellipsoid",)), 1, "out")
     untouched(tmp_path)
 
 

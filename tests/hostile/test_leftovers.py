@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import resource
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -15,15 +14,11 @@ from impact_posture.system.libraries import cache_path
 from impact_posture.system.scratch_folder import scratch_folder
 from tests.hostile.arena import PUSH, SMALL, SWEEP
 from tests.support.command import refused, run
+from tests.support.tools import files_of
 
 
 def names(folder: Path) -> list[str]:
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
-
-
-def files_of(size: int) -> Callable[[], None]:
-    """Return a function that lets no file grow beyond a size, as a full disk does."""
-    return lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
 
 
 # ---- full disks and compilers --------------------------------------------------------------------------------------

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import resource
 import shutil
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -27,6 +29,17 @@ def need(tool: str) -> str:
     if path is None:
         pytest.skip(f"no {tool}")
     return path
+
+
+def files_of(size: int) -> Callable[[], None]:
+    """Return a function after which no file of this process grows beyond a size, as on a full disk."""
+
+    def limit() -> None:
+        # Python 3.11 would leave truncated bytecode, with which later imports fail.
+        sys.dont_write_bytecode = True
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+
+    return limit
 
 
 def cxx_compiler() -> list[str] | None:
