@@ -278,8 +278,8 @@ class CompiledController:
 
         Raises:
             InputError: This phase cannot follow the present phase, or ``t`` is before the time of a phase that has
-                not begun yet.  Another reason is a ``t_impact`` that is not finite, or that the controller cannot use
-                because it has no reference flow.
+                not begun yet.  The same error is raised if ``t_impact`` is not finite, or if the controller has no
+                reference flow.
         """
         if t_impact is None:
             self._enter("brace", t)

@@ -79,7 +79,8 @@ def renamed(sources: dict[str, bytes], prefix: str) -> dict[str, str]:
     headers = "".join(sources[name].decode() for name in _HEADERS)
     names = re.findall(r"^(?:void|int|c_float) (\w+)\(", headers, re.MULTILINE)
     renames = "".join(f"#define {name} {prefix}_{name}\n" for name in sorted(names))
-    header = f"""/* DAQP {VERSION}.  Its functions have names of this controller unless a library is linked. */
+    header = f"""/* DAQP {VERSION}.  The names of its functions begin with the prefix of this controller, unless an
+ * installed DAQP is linked. */
 #ifndef {prefix.upper()}_INSTALLED_DAQP
 {renames}#endif
 #include "daqp.h"

@@ -116,7 +116,7 @@ def export_controller(
     structure = structure_of(robot, formulation)
     if (structure.robust is None and structure.flow is None) != (objective is None):
         what = "the posture task has no objective" if objective is None else "no task uses the objective"
-        hint = "give the objective of its gradient" if objective is None else "give a posture task that follows one"
+        hint = "give the objective of its gradient" if objective is None else "give a posture task with a gradient"
         raise InputError(what, where="controller export", hint=hint)
     along = {} if path is None else render_path(structure, path_reference(robot, path, objective), prefix)
     sources = daqp_sources(Path(daqp) if daqp else None)

@@ -1,7 +1,7 @@
 """Build a MuJoCo model from a ``pin.Model``, with the same bodies, joints, inertias and armature.
 
-The URDF reader of MuJoCo is not used.  It loses package paths, the floating base and the armature, and changes the
-order of joints.  The model has no geometry.  A simulation adds shapes with :meth:`Mjcf.add_geom` and
+The URDF reader of MuJoCo is not used, because it loses package paths, the floating base and the armature, and changes
+the order of joints.  The model has no geometry.  A simulation adds shapes with :meth:`Mjcf.add_geom` and
 :meth:`Mjcf.add_plane`.
 """
 

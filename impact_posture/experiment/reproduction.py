@@ -28,7 +28,7 @@ class PaperRow:
     Attributes:
         nominal: ``q_total_impact`` of the nominal TSID controller.
         robust: ``q_total_impact`` of the impact-robust TSID controller.
-        reduction: Reduction in the text of the paper, as a share of ``nominal``.
+        reduction: Reduction in the text of the paper, as a fraction of ``nominal``.
     """
 
     nominal: float

@@ -34,7 +34,7 @@ _LOADS = (
         "",
         "largest change of velocity of the worst joint, which has the largest share of its velocity limit",
     ),
-    ("joint_share", "", "joint_velocity, as a share of the joint's velocity limit"),
+    ("joint_share", "", "joint_velocity, as a fraction of the joint's velocity limit"),
     ("impulse", "N·s", "impulse of the contact along the normal, mean of the contacts"),
 )
 # Metrics with another meaning in push scenarios: key → meaning.

@@ -86,7 +86,7 @@ class ControllerRow:
         failed: Seed and reason of each run that did not complete, one line per run.
         metrics: Name in :data:`QUANTITIES` → mean over the completed runs; empty if no run completed.  Quantities
             that do not exist for this robot are left out.
-        reduction: Reduction of ``q_total_impact`` relative to nominal with the same seed, as a share.  ``None`` if
+        reduction: Reduction of ``q_total_impact`` relative to nominal with the same seed, as a fraction.  ``None`` if
             there are no nominal runs, or if a run of either controller did not complete.
         recovery: Like ``reduction``, but for ``q_total_recovery``.
         change: Name in :data:`QUANTITIES` → difference from nominal; empty if ``reduction`` is ``None``.

@@ -95,7 +95,7 @@ class WorstCaseObjective:
 
     @property
     def structure(self) -> str:
-        """Text that identifies the expressions, without the normal of the first contact, which is a parameter."""
+        """Text that identifies the expressions, without the normal of the first contact (a parameter)."""
         contact = self.contact
         return repr(
             (

@@ -214,7 +214,7 @@ def open_atlas(folder: str | Path) -> Dataset:
         names = {path.relative_to(data).as_posix(): path for path in paths if manifest.has_checksums}
         damaged = [name for name, path in names.items() if not passes_of(read_bytes(path), manifest.key, name)]
         if damaged:
-            hint = "run sweep again, which solves its shards again, and move files away that it did not write"
+            hint = "run sweep again to solve these shards again, and move away files that sweep did not write"
             raise SpecError(f"has damaged shards ({listed(damaged)})", where=str(folder), hint=hint)
         pages = dataset.ParquetFragmentScanOptions(page_checksum_verification=True)
         form = dataset.ParquetFileFormat(default_fragment_scan_options=pages)

@@ -28,7 +28,7 @@ from impact_posture.system.arrays import Array
 _ROUNDS, _UNSURE = 8, 3
 # Postures whose joints differ by more than this (rad, m) may belong to different optima.
 SWITCH = 0.2
-# A new optimum replaces the known optimum only if it lowers the objective by at least this share.
+# A new optimum replaces the known optimum only if it lowers the objective by at least this fraction.
 _BETTER = 1e-4
 
 # Target position and orientation of the contact frame; ``None`` to keep the value at the given posture.

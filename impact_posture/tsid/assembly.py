@@ -19,7 +19,7 @@ from impact_posture.tsid.tasks.task import TaskStack
 _IDLE = 1e-8
 # Weight of a squared moment, (N·m)², relative to a squared force, N².
 _MOMENT = 100.0
-# The tasks leave a direction of motion free if its singular value is below this share of the largest one.
+# The tasks leave a direction of motion free if its singular value is below this fraction of the largest one.
 _REDUNDANT = 1e-6
 
 

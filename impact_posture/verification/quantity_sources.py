@@ -24,7 +24,7 @@ from impact_posture.system.scratch_folder import scratch_folder
 # ``_FIRST_STEP`` is the first step of the finite differences, rad (m), and ``_LEVELS`` is the number of steps.  Each
 # step is half as long as the previous step.
 _FIRST_STEP, _LEVELS = 0.02, 7
-# The scale of the relative errors of H, G and ∇H is at least this share of the largest H or G over all normals.
+# The scale of the relative errors of H, G and ∇H is at least this fraction of the largest H or G over all normals.
 # Without this lower bound, the scale would be zero if the contact cannot move along n.
 _FLOOR = 1e-3
 

@@ -184,7 +184,7 @@ def test_the_command_names_damaged_files(solved: tuple[Sweep, str, Path], tmp_pa
     assert shown.returncode == 1
     assert shown.stderr == (
         "error: out: has damaged shards (case=0/shard-000001.parquet); "
-        "run sweep again, which solves its shards again, and move files away that it did not write\n"
+        "run sweep again to solve these shards again, and move away files that sweep did not write\n"
     )
     again = run("sweep", "sweep.toml", "--out", "out", "--workers", "1", cwd=tmp_path)
     warning = "warning: data/case=0/shard-000001.parquet was damaged or of another sweep, and was written again\n"

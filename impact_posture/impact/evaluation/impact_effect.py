@@ -21,8 +21,8 @@ class WorstJoint(JsonBlock):
         name: Name of the joint.
         velocity: Size of the velocity jump of this joint, in ``unit``.
         unit: ``rad/s`` or ``m/s``.
-        share: Velocity jump divided by the velocity limit of this joint; ``None`` if no joint has a limit.  Then the
-            joint has the largest jump in rad/s, or in m/s if no joint turns.
+        share: Velocity jump divided by the velocity limit of this joint; ``None`` if no joint has a limit.  Without
+            limits, the worst joint is the joint with the largest jump in rad/s, or in m/s if no joint turns.
     """
 
     name: str

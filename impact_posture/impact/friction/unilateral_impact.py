@@ -28,14 +28,14 @@ from impact_posture.impact.quantities.impact_oracle import ImpactOracle
 from impact_posture.robot.robot_spec import Support
 from impact_posture.system.arrays import Array
 
-# A contact point moves if its speed is above this share of the approach speed.  A moving point lifts if its upward
-# speed is above a tenth of this share; otherwise it slides.
+# A contact point moves if its speed is above this fraction of the approach speed.  A moving point lifts if its upward
+# speed is above a tenth of this fraction; otherwise it slides.
 _MOVES = 0.01
 # Number of steps of an impact in which the weight is counted.
 _STEPS = 8
-# Resolution of the shortest contact time at which the feet stay, as a share of the largest time.
+# Resolution of the shortest contact time at which the feet stay, as a fraction of the largest time.
 _SHORTEST = 1e-4
-# A robot with locked joints stands if its feet balance the weight up to this share of the weight.
+# A robot with locked joints stands if its feet balance the weight up to this fraction of the weight.
 _STANDS = 1e-6
 
 

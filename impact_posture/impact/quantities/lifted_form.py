@@ -114,7 +114,7 @@ class UnknownJump:
         f: Unknown support impulses, in the axes of the feet.
         variables: All unknowns: ``a``, ``f``, and the impulse of the impact if it is unknown.
         residual: ``M a − J_sᵀf − (generalized impulse of the impact)``, then ``J_s a + εf``, then equations that
-            determine the impulse of the impact if it is unknown.
+            determine the impulse of the impact if this impulse is unknown.
         rest: The terms of the residual without derivatives in closed form: the impulse of the impact, and the rows
             of locked joints.
         derivatives: Derivatives of ``residual − rest`` in closed form.

@@ -10,7 +10,7 @@ from impact_posture.impact.evaluation.impact_effect import ImpactLoad
 
 Side = Literal["base", "joints", "impulse", "force"]
 
-# Relative changes below this value are about the same.
+# If the relative change of a quantity is below this value, the quantity is "about the same".
 SAME = 0.05
 # Changes of a velocity (m/s or rad/s) below this fraction of the approach speed (m/s) are negligible.
 FELT = 0.01

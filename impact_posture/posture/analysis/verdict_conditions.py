@@ -1,4 +1,4 @@
-"""Conditions under which a verdict holds; they come before its numbers."""
+"""Conditions under which a verdict holds; the verdict states these conditions before its numbers."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from impact_posture.impact.elasticity.contact_compression import milliseconds
 from impact_posture.impact.evaluation.evaluation import Evaluation
 from impact_posture.impact.resolved_impact import ResolvedImpact
 
-# If the attainable speed is below the approach speed by less than this fraction, it is treated as sufficient, because
+# An attainable speed that is below the approach speed by less than this fraction is treated as sufficient, because
 # the verdict shows only three digits of both speeds.
 _REACHED = 5e-3
 # Largest travel of the contact point in the compression time, m, for which the posture is treated as constant.  Up to

@@ -94,9 +94,9 @@ class Surroundings:
         plane at the given posture.  If a link extends behind the plane, the plane is moved back to the deepest point
         of the contact link and the links fixed to it.  The contact link and the links fixed to it may touch the
         surface.  Other links may touch the surface if their own contacts lie in the plane, for example a foot next to
-        the struck foot.  This also applies to contacts at the same surface, for example the other hand at a wall.  If
-        a foot or a fixed base lies behind the plane, a patch is used instead, because the surface must end before
-        this body.
+        the struck foot.  The links of other contacts at the same surface may also touch the surface, for example the
+        other hand at a wall.  If a foot or a fixed base lies behind the plane, a patch is used instead, because the
+        surface must end before this body.
 
         ``width`` is the edge length of the patch, m; infinite for the plane.  If ``width`` is ``None``, the plane is
         used unless a fixed body lies behind the plane.  ``feet`` are the contact points of the feet.  ``contacts``

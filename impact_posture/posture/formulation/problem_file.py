@@ -43,7 +43,7 @@ _WORKED_OUT = {"contact_pose", "base", "hold", "com_margin", "limit_margin"}
 
 @dataclass(frozen=True)
 class Prepared:
-    """A problem that is ready to be solved, with its settings and the impact that they define."""
+    """A problem that is ready to be solved, with its settings and the impact that the settings define."""
 
     settings: ProblemSettings
     impact: ResolvedImpact

@@ -15,7 +15,7 @@ from impact_posture.system.arrays import Array
 
 # A share (:class:`Equilibrium`) is treated as equal to the largest share if the difference is below this value.
 _TIED = 1e-9
-# Maximum number of iterations of ``_even_share``, each of which removes feet that would have to pull.
+# Maximum number of iterations of ``_even_share``; each iteration removes feet that would have to pull.
 _TURNS = 4
 # A load factor λ above this value is reported as infinite.
 _MOST = 1e6

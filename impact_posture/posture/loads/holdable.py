@@ -32,7 +32,7 @@ _PRICE = 1e-3
 
 
 class Holdable(Constraint):
-    """The constraint that forces z exist with which the base is balanced and no actuator exceeds its limits.
+    """The constraint that some forces z balance the base while no actuator exceeds its limits.
 
     In the nonlinear program, ``R τ(q, z)`` must be within bounds (:class:`Equilibrium`).  ``c(q)`` has one row for
     the unbalanced wrench on the base, and for each actuator the row ``share − 1``, where 1 is the share at a limit.

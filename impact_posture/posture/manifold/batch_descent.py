@@ -29,7 +29,7 @@ _PROJECTING = 10
 _FIRST, _LONGEST = 0.3, 0.6
 # A descent ends if its trust radius falls below this value, rad or m.
 _SHORTEST = 1e-6
-# A step is accepted if the merit decreases by at least this share of the predicted decrease.
+# A step is accepted if the merit decreases by at least this fraction of the predicted decrease.
 _SUFFICIENT = 1e-4
 # Factor that shortens a rejected step.
 _SHORTER = 0.3

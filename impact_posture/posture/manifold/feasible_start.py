@@ -26,7 +26,7 @@ _PATIENCE = 16
 CANDIDATES = 3
 # Standard deviations of the base of a floating robot in random postures: position, m, and rotation, rad.
 BASE_SPREAD = np.array([0.15, 0.15, 0.15, 0.15, 0.15, 0.6])
-# Share of the trace that is added to the diagonal of a matrix that may be singular.
+# Fraction of the trace that is added to the diagonal of a matrix, because the matrix may be singular.
 ROUNDING = 1e-13
 
 

@@ -25,21 +25,21 @@ _SINGULAR = 1e-7
 _TURN = 0.98
 # If this cosine is exceeded, the next step is longer.
 _STRAIGHT = 0.995
-# A posture belongs to a node only if its distance from the tangent space of the node is at most this share of its
+# A posture belongs to a node only if its distance from the tangent space of the node is at most this fraction of its
 # distance from the node.
 _FLAT = 0.2
-# Each point of a curve is closer to a node than this share of a step.  On a straight line, half a step would suffice.
-# Where the curve bends, points between two nodes are slightly farther away.
+# Each point of a curve is closer to a node than this fraction of a step.  On a straight line, half a step would
+# suffice.  Where the curve bends, points between two nodes are slightly farther away.
 _HALF = 0.52
 # Maximum number of nodes of a curve or surface.
 _NODES = 20_000
 # Length of a step on a surface, rad or m.
 _STEP = 0.16
-# Least distance between the nodes of a surface, as a share of the step.
+# Least distance between the nodes of a surface, as a fraction of the step.
 _APART = 0.7
 # Number of directions in which steps from a node of a surface are tried.
 _DIRECTIONS = 8
-# Radius that a node of a surface covers, as a share of the step.  The direction to any point one step away differs
+# Radius that a node of a surface covers, as a fraction of the step.  The direction to any point one step away differs
 # from a tried direction by at most half the angle between tried directions.  This bounds the distance from the point
 # to a tried point.  Each tried point lies within ``_APART`` of a node, and the radius is the sum of both distances.
 COVERED = _APART + 2 * np.sin(np.pi / _DIRECTIONS / 2)

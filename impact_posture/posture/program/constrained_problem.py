@@ -126,7 +126,7 @@ class ConstrainedProblem:
 
 
 def rank(jacobian: Array, tolerance: float = RANK_TOLERANCE) -> int:
-    """Return the rank of a constraint Jacobian; singular values up to ``tolerance`` count as zero."""
+    """Return the rank of the Jacobian of constraints; singular values up to ``tolerance`` count as zero."""
     return int(np.linalg.matrix_rank(jacobian, tol=tolerance)) if jacobian.size else 0
 
 

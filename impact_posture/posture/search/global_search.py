@@ -27,9 +27,9 @@ from impact_posture.posture.program.ipopt import one_blas_thread
 from impact_posture.posture.search.multistart import PostureSolution, solve
 from impact_posture.system.arrays import Array
 
-# An objective is better than another if it is lower by more than this share.
+# An objective is better than another if it is lower by more than this fraction.
 _BETTER = 1e-6
-# A start missed the best posture if the objective at its end is more than this share above the best objective.
+# A start missed the best posture if the objective at its end is more than this fraction above the best objective.
 _MISSED = 1e-3
 _KEYS = ("redundancy", "improvement", "missed_rate", "unseen_share", "estimated_optima", "hops", "word", "line")
 # Attributes of a solution that describe the search before the map.

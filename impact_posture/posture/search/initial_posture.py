@@ -18,10 +18,10 @@ from impact_posture.system.arrays import Array
 
 # If ``beside`` has this small value, :func:`find_conflicts` stops after a few starts when a conflict remains.
 _QUICK = 1e-9
-# If no posture allows the speed of a strike, the required speed is below the greatest speed by this share, so that
+# If no posture allows the speed of a strike, the required speed is below the greatest speed by this fraction, so that
 # the program has an interior.
 _SLOWER = 1e-3
-# A greatest speed below this share of the stated speed is a conflict.
+# A greatest speed below this fraction of the stated speed is a conflict.
 _LEAST_SPEED = 0.01
 # Number of speeds that the search for the greatest speed tries if other constraints conflict with the speed.
 _BISECTIONS = 8

@@ -181,7 +181,7 @@ def solve(
         values += (1,) * dominated
         estimate = SearchEstimate.of("multistart", values, hits_of_best(optima), bound=dominated > 0)
     else:
-        # Descents stop early in flat valleys, so their shares are probably too high.
+        # Descents stop early in flat valleys, so the estimated fraction of unseen optima is probably too high.
         more = screening.hops, True, screening.partial
         estimate = SearchEstimate.of("adaptive", screening.values, hits_of_best(optima), *more)
     if estimate.hits_of_best <= 1 and estimate.starts >= _MANY:
@@ -241,8 +241,8 @@ def distinct(
 ) -> tuple[Optimum, ...]:
     """Group final postures, given with their objectives, by optimum; the best objective comes first.
 
-    ``hits`` is the number of starts that each posture stands for, by default one.  Objectives that differ by less
-    than 1e-9 of ``scale`` count as equal, and keep the order of ``ends``.
+    ``hits`` is the number of starts that ended at each posture, by default one.  Objectives that differ by less than
+    1e-9 of ``scale`` count as equal, and keep the order of ``ends``.
     """
     optima: list[Optimum] = []
     weighted = [(*end, count) for end, count in zip(ends, hits or [1] * len(ends), strict=True)]

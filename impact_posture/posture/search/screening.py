@@ -35,12 +35,12 @@ _SLOWEST = 1 / 16
 _WORK = 40_000_000
 # Number of descents that are always allowed.
 _LEAST = 16
-# If less than this share of the first random postures reaches the equalities, their ends differ too little.
-# Descents then also begin from starts that satisfy all constraints.
+# If less than this fraction of the first random postures reaches the equalities, the descents end at too similar
+# postures.  Descents then also begin from starts that satisfy all constraints.
 _REACHED = 0.4
 # Number of starts that satisfy all constraints.
 _FEASIBLE = 128
-# Largest number of these starts, as a share of all allowed descents.
+# Largest number of these starts, as a fraction of all allowed descents.
 _PART = 1 / 8
 # Share of the new descents that are hops.
 _HOPPING = 0.75

@@ -16,9 +16,10 @@ from impact_posture.robot.model_joints import scalar_value
 from impact_posture.system.arrays import Array
 from impact_posture.system.escape import toml
 
-# A direction is lost if the joints move the constrained frame along it by less than this share of the largest motion.
+# A direction is lost if the joints move the constrained frame along it by less than this fraction of the largest
+# motion.
 _LOST = 1e-3
-# A direction is nearly lost up to this share of the largest motion.
+# A direction is nearly lost up to this fraction of the largest motion.
 _CLEAR = 5e-3
 # Angle by which joints are bent, rad.
 _BEND = 0.5
@@ -30,7 +31,7 @@ _SAMPLES = 8
 
 @dataclass(frozen=True)
 class SingularTarget:
-    """A constraint whose Jacobian has a lower rank at all given postures than at others.
+    """A constraint whose Jacobian has a lower rank at all given postures than at random postures.
 
     Attributes:
         name: Name of the constraint.
@@ -87,7 +88,7 @@ class _Gains:
 
 
 def _bent(problem: ConstrainedProblem, gains: _Gains, rank: int) -> dict[str, float]:
-    """Return the fewest joint positions that bend the given posture so that no direction is nearly lost."""
+    """Return positions of as few joints as possible, so that the bent posture nearly loses no direction."""
     robot, bent, best = problem.robot, dict[str, float](), problem.given
     model, steps = robot.model, np.eye(robot.nv)
     # Only joints with a single velocity entry are bent.

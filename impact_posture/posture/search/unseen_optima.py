@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 
 from impact_posture.config.json_block import JsonBlock
 
-# Rule of three.  If N starts reached each optimum at least twice, at most the share ``_RULE_OF_THREE / N`` of further
-# starts leads to a new optimum, with a confidence of 95 %.
+# Rule of three.  If N starts reached every optimum at least twice, at most the fraction ``_RULE_OF_THREE / N`` of
+# further starts leads to a new optimum, with a confidence of 95 %.
 _RULE_OF_THREE = 3
 # Two objectives count as one up to this relative difference.
 SAME_VALUE = 5e-3
@@ -87,9 +87,9 @@ def hits_by_value(values: ArrayLike, hits: ArrayLike) -> tuple[int, ...]:
 
 
 def unseen_share(hits: Sequence[int]) -> float:
-    """Estimate, from the hits of each optimum, the share of further starts that would end in an optimum not seen yet.
+    """Estimate, from the hits of each optimum, the fraction of further starts that would end in a new optimum.
 
-    The Good–Turing estimate is the share of starts that ended in an optimum with only one hit (I. J. Good, "The
+    The Good–Turing estimate is the fraction of starts that ended in an optimum with only one hit (I. J. Good, "The
     population frequencies of species and the estimation of population parameters", Biometrika 1953).
     """
     return sum(count == 1 for count in hits) / max(sum(hits), 1)

@@ -8,7 +8,7 @@ import numpy as np
 
 from impact_posture.system.arrays import Array
 
-# A direction gets a spring instead of a constraint if its singular value is below this share of the largest one.
+# A direction gets a spring instead of a constraint if its singular value is below this fraction of the largest one.
 # Rows of points on one body can be almost dependent.  As constraints, these rows would switch on and off from posture
 # to posture, and the flow would never rest.
 SLACK = 2e-2

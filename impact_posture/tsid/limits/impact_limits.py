@@ -15,7 +15,7 @@ from impact_posture.tsid.point_kinematics import Point
 from impact_posture.tsid.state import PERIOD, State
 from impact_posture.tsid.support_contact import SupportContact
 
-# Singular values of a contact Jacobian below this share of the largest singular value are treated as zero.
+# Singular values of a contact Jacobian below this fraction of the largest singular value are treated as zero.
 _RANK = 1e-6
 
 

@@ -27,7 +27,7 @@ Spring = Literal["keep", "release", "follow"]
 
 # Step of the central differences of the gradient, rad.
 _STEP = 1e-5
-# Lower bound on the curvature scale ``λ``, as a share of H, per rad².
+# Lower bound on the curvature scale ``λ``, as a fraction of H, per rad².
 _FLAT = 1e-3
 # Default distances from a position limit between which the term fades out, rad (m).
 FADE = (0.05, 0.2)
