@@ -25,7 +25,7 @@ LARGEST_VECTOR = 64
 # Stack bytes for return addresses, saved registers, alignment and the variables of the small functions.  The stack
 # contains the variables of only one block at a time, because the macro APART prevents the inlining of blocks.
 _FRAMES = 2048
-# With -march=native, a compiler can combine neighboring numbers to vectors.  The stack then grows by up to this
+# With -march=native, a compiler can combine neighboring numbers into vectors.  The stack then grows by up to this
 # factor, because several vectors may contain the same number.
 _SPILL = 2
 

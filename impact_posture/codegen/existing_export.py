@@ -23,8 +23,8 @@ _OTHERS = ("posture", "compression", "stack_bytes")
 def existing_export(objective: WorstCaseObjective, out: Path, *, build: bool) -> Export | None:
     """Return the unchanged export of an objective in the folder ``out``; ``None`` if it is missing or changed.
 
-    The manifest can state any posture and compression of the impact.  All other content must equal the manifest that
-    :func:`~impact_posture.codegen.export.export` would write.  If ``build`` is true, the library is built and
+    Posture and compression of the impact may differ from the manifest.  All other content must equal the manifest
+    that :func:`~impact_posture.codegen.export.export` would write.  If ``build`` is true, the library is built and
     checked.
 
     Raises:

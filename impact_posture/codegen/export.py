@@ -243,7 +243,7 @@ def default_prefix(objectives: Sequence[WorstCaseObjective]) -> str:
 
 
 def _same_robot(objective: WorstCaseObjective | Sequence[WorstCaseObjective]) -> tuple[WorstCaseObjective, ...]:
-    """Return the objectives as a tuple; raise InputError if they differ in more than the contact."""
+    """Return the objectives as a tuple; raise ``InputError`` if they differ in more than the contact."""
     objectives = (objective,) if isinstance(objective, WorstCaseObjective) else tuple(objective)
     if not objectives:
         raise InputError("no objective is given", where="codegen", hint="give one objective for each frame")

@@ -69,7 +69,7 @@ def _bundles(
     """Return node → all nodes of the vector to which the node belongs.
 
     Operations with the same key are in the same list of ``levels``, so the vectors of a list are complete before the
-    next list is processed.  Operations stay single unless each limb has exactly one operation with their key.
+    next list is processed.  Operations become a vector only if each limb has exactly one operation with the same key.
     """
     bundles: dict[int, tuple[int, ...]] = {}
     lanes: dict[int, tuple[int, int]] = {}

@@ -114,8 +114,8 @@ def _parsed(stamp: _Stamp) -> Mesh:
             if sum(entry.file_size for entry in archive.infolist()) > LARGEST_FILE:
                 raise UnusableShape(too_large(path))
     transform, unit = _root_transform(path), _unit(path)
-    # Use a new loader every time, because a loader keeps all meshes in memory.  The volumes are not used, and BV_AABB
-    # volumes are made fastest.
+    # Use a new loader every time, because a loader keeps all meshes in memory.  The loader needs a type of bounding
+    # volumes.  They are not used, and volumes of the type ``BV_AABB`` are built fastest.
     shape = coal.MeshLoader(coal.BV_AABB).load(str(path), np.ones(3))
     points, triangles = mesh_points(shape), mesh_triangles(shape)
     if len(points) > max(_MOST_VERTICES, stamp[1]):

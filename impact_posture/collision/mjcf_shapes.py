@@ -76,7 +76,7 @@ def solid_geoms(model: Any) -> Iterator[tuple[int, list[int]]]:
 
 
 def disabled_bodies(model: Any) -> set[frozenset[str]]:
-    """Return the pairs of bodies that may touch: excluded pairs, and bodies whose joints follow each other.
+    """Return the pairs of bodies that may touch: excluded pairs, and bodies in the same or consecutive rigid groups.
 
     As in MuJoCo, bodies without joints count as one body with their parents.
     """

@@ -98,7 +98,7 @@ class _Source:
         return tuple(bare)
 
     def all_warnings(self, used: Collection[str], warnings: Iterable[str]) -> tuple[str, ...]:
-        """Return all warnings, including the ``warnings`` that loading the shapes of the links ``used`` gave."""
+        """Return all warnings; ``warnings`` come from loading the shapes of the links ``used``."""
         words, bare = [] if used else [NO_SHAPES], self.without_shapes(used)
         if used and bare:
             named = f"links without shapes: {listed(bare)}"

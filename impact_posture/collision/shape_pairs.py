@@ -16,7 +16,7 @@ from impact_posture.robot.robot import Robot
 from impact_posture.robot.urdf import read_srdf
 from impact_posture.system.arrays import Array
 
-# Number of random postures in touching_by_design, and in nested_pairs.
+# Number of random postures in ``touching_by_design``, and in ``nested_pairs``.
 _POSTURES = 1000
 _COUNTED = 100
 _SEED = 0

@@ -69,7 +69,7 @@ class JumpDerivatives:
         self._parents = [int(parent) for parent in tree.model.parents]
         slots = tree.chart.slots
         self._beyond = [slot for slot in slots if self._parents[slot.index]]
-        # Joint index of each degree of freedom, and of each column of a _Motion.
+        # Joint index of each degree of freedom, and of each column of a ``_Motion``.
         self._of_v = [slot.index for slot in slots for _ in range(slot.kind.nv)]
         self._of_u = [slot.index for slot in self._beyond]
 
@@ -116,7 +116,7 @@ class JumpDerivatives:
         return ca.tril2symm(below) + ca.diag(self._tree.armature)
 
     def _of_momentum(self, motion: _Motion) -> ca.SX:
-        """Return the derivative of ``M x + J_sᵀ(impulses)`` for the arguments of :meth:`_motion`, (nv, joints)."""
+        """Return the derivative of ``M x + J_sᵀ(impulses)``; arguments of :meth:`_motion`, shape (nv, joints)."""
         below = _kept(self._momenta.T @ motion.turned, self._lies_on(self._of_v, self._of_u))
         above = _kept(motion.changed.T @ self._subspaces, self._lies_on(self._of_u, self._of_v, itself=False))
         return below + above.T

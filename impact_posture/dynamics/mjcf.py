@@ -105,7 +105,7 @@ class Mjcf:
         self.add_geom(WORLD, name, "plane", (1.0, 1.0, 1.0), pin.SE3(upright, np.array(point)))
 
     def compile(self) -> Any:
-        """Return the ``mujoco.MjModel``; raise InputError if MuJoCo rejects the model."""
+        """Return the ``mujoco.MjModel``; raise ``InputError`` if MuJoCo rejects the model."""
         mujoco = import_mujoco()
         try:
             model = self.spec.compile()
@@ -232,7 +232,7 @@ def _add_joints(body: Any, model: pin.Model, slot: JointSlot, free: bool, taken:
 
 
 def _alike(armature: Array, slot: JointSlot) -> None:
-    """Raise InputError if the axes of a ball, or the slides before a rotation, have different armatures."""
+    """Raise ``InputError`` if the axes of a ball, or the slides before a rotation, have different armatures."""
     if armature.size and np.ptp(armature) > 0:
         what = f"the armature of joint '{slot.name}' differs between its axes"
         raise InputError(what, where="MJCF", hint="give all axes of the joint the same armature")

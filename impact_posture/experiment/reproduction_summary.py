@@ -20,7 +20,7 @@ _COLUMNS = {
     "peak_force": 3,
 }  # fmt: skip
 LEGEND = (
-    f"Recovery is the same integral and peak {UNTIL_RECOVERY}. In a relaxed tick, limits made a task "
+    f"The recovery columns show the same integral and peak {UNTIL_RECOVERY}. In a relaxed tick, limits made a task "
     "give way. The status is `completed`, or how many runs completed. There is no reduction if a run did not "
     "complete."
 )
@@ -104,9 +104,9 @@ def summary(results: Reproduction) -> str:
         table_one(results),
         "Values that were fitted to the paper:",
         fitted(results),
-        "The paper has other robots, gains, contact models and windows, and prints few of them. Compare reductions, "
-        "not values. `q_total_impact` is the integral of ‖ν‖ over fixed windows, which are the same for every "
-        "controller. Contacts are summed, and pushes are the mean of both signs.",
+        "The paper has other robots, gains, contact models and windows, and states few of these values. Compare "
+        "reductions, not values. `q_total_impact` is the integral of ‖ν‖ over fixed windows, which are the same for "
+        "every controller. Contacts are summed, and pushes are the mean of both signs.",
         "A seed above zero changes the start, the speed or force, and the friction (`[spread]` in the scenario), and "
         "the sensor noise. The intervals contain all these effects.",
         LEGEND,

@@ -86,7 +86,7 @@ def build_metric(robot: Robot, kind: MetricKind, weights: str | tuple[float, ...
 
 
 def check_weights(robot: Robot, weights: Sequence[float] | None) -> None:
-    """Raise MetricError if ``weights`` does not have nv entries."""
+    """Raise ``MetricError`` if ``weights`` does not have nv entries."""
     if weights is not None and np.shape(weights) != (robot.nv,):
         hint = f"give {robot.nv} numbers above zero"
         raise MetricError(f"has {np.size(weights)} entries", where="weights", hint=hint)

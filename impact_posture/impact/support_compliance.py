@@ -38,7 +38,7 @@ def least_compliance(robot: Robot) -> float:
 
 
 def check_compliance(robot: Robot, compliance: float) -> None:
-    """Raise InputError for a support compliance ε, 1/kg, that is below :func:`least_compliance` or not finite."""
+    """Raise ``InputError`` for a support compliance ε, 1/kg, that is below :func:`least_compliance` or not finite."""
     least = least_compliance(robot)
     if not (np.isfinite(compliance) and compliance >= least):
         hint = f"give at least {least:.3g}, which is 1e-6 divided by the mass; stiffer feet cause rounding errors"

@@ -48,7 +48,7 @@ def _support(robot: Robot, text: str, known: Mapping[str, Support]) -> Support:
 
 
 def refuse_held(robot: Robot, contact: ImpactContact, supports: Sequence[Support]) -> None:
-    """Raise ContactError if a support holds the contact point, so that only the support compliance could yield."""
+    """Raise ``ContactError`` if a support holds the contact point, so that only the compliance could yield."""
     point = point_on(robot, contact.frame, contact.offset)
     for support in supports:
         foot = point_on(robot, support.frame, support.offset)
@@ -62,7 +62,7 @@ def refuse_held(robot: Robot, contact: ImpactContact, supports: Sequence[Support
 
 
 def refuse_rigid(robot: Robot, supports: Sequence[Support]) -> None:
-    """Raise InputError if all joints of a standing robot are locked, so that only the supports could yield."""
+    """Raise ``InputError`` if all joints of a standing robot are locked, so that only the supports could yield."""
     if supports and np.isinf(robot.model.armature[6:]).all():
         what = f"all joints of {robot.name} are locked and its feet stay, so nothing moves in an impact"
         hint = "choose reflected or link, or no `support` for a robot off the ground"

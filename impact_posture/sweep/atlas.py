@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 _DATA = "data"
 # Folder for results of the first pass.  Neighboring shards start from these results even after the second pass has
-# replaced the file in _DATA.
+# replaced the file in ``_DATA``.
 _FIRST_PASS = "first-pass"
 # Number of shards whose postures stay in memory, because consecutive shards have common neighbors.
 _KEPT = 16
@@ -225,7 +225,7 @@ def open_atlas(folder: str | Path) -> Dataset:
 
 @contextmanager
 def reading(folder: Path) -> Iterator[None]:
-    """Convert errors of Parquet files that are read within the block to a SpecError about their folder."""
+    """Convert errors of Parquet files that are read within the block to a ``SpecError`` about their folder."""
     from pyarrow import ArrowException
 
     try:

@@ -30,7 +30,7 @@ from impact_posture.system.arrays import Array
 from impact_posture.system.escape import plot_label
 from impact_posture.system.output_folder import added_files
 
-# Two neighboring points count as different optima if the difference of their postures exceeds SWITCH and this
+# Two neighboring points count as different optima if the difference of their postures exceeds ``SWITCH`` and this
 # multiple of the lower quartile of all differences.  The lower quartile estimates the difference between neighbors
 # with the same optimum.  The difference of two postures is a norm in the tangent space, without the position of the
 # base.

@@ -81,7 +81,7 @@ static void keep_active(Relaxation *r, int level) {
     for (int j = 0; j < r->count; j++) warm[r->entry[j]] = r->daqp.sense[j] & (DAQP_ACTIVE | DAQP_LOWER);
 }
 
-/* Make the active rows of a program that are not soft the exact rows. */
+/* Turn the active rows of a program, except soft rows, into the exact rows. */
 static void list_active(Relaxation *r) {
     clear_rows(r);
     for (int j = 0; j < r->daqp.n_active; j++) {
@@ -135,8 +135,8 @@ static int drop_rows(Relaxation *r) {
     return 1;
 }
 
-/* Make the equations and the violated rows of the level the close rows.  If the level cannot hold, make the active
- * rows of earlier levels the exact rows. */
+/* Turn the equations and the violated rows of the level into the close rows.  If the level cannot hold, turn the
+ * active rows of earlier levels into the exact rows. */
 static void list_held(Relaxation *r, int level, int missed) {
     clear_rows(r);
     if (missed) list_active(r);

@@ -42,7 +42,7 @@ TIP_RADIUS = 0.01
 _TIP_ONLY = f"a flat or padded tool touches longer than the assumed steel tip of {1e3 * TIP_RADIUS:g} mm radius"
 # A joint whose jump is below this fraction of the largest jump of a joint does not determine x.
 _MOVED = 0.1
-# If x ≤ SHORT, only the links respond.  If x ≥ LONG, the rotors respond too (docs/which-inertia.md).
+# If x ≤ ``SHORT``, only the links respond.  If x ≥ ``LONG``, the rotors respond too (docs/which-inertia.md).
 SHORT, LONG = 0.2, 0.75
 GIVE_ELASTICITY = "add `contact_stiffness` (N/m, or a material) or `contact_duration`"
 """Hint of the errors about an unknown elasticity of the contact."""

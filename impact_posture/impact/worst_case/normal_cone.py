@@ -43,7 +43,7 @@ _UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 def check_cone(kind: type[ImpactKind], degrees: float) -> None:
-    """Raise MetricError if ``degrees`` > 0 and the objective type is not a :class:`QuadraticKind`."""
+    """Raise ``MetricError`` if ``degrees`` > 0 and the objective type is not a :class:`QuadraticKind`."""
     if degrees and not issubclass(kind, QuadraticKind):
         hint = "choose `objective` impulse, sticking or energy, or `normal_cone` 0"
         raise MetricError(kind.no_cone, where="normal_cone", hint=hint)

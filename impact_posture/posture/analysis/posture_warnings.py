@@ -22,7 +22,7 @@ _BEHIND = 0.01
 def posture_warnings(
     prepared: Prepared, initial: Array, q: Array, holding: HoldingForces | None, name: str = "optimal"
 ) -> list[str]:
-    """Return warnings about holding forces, surface and ground for a posture ``q``; the texts call it ``name``.
+    """Return warnings about holding forces, surface and ground for the posture ``q`` with the name ``name``.
 
     ``holding`` are the forces that hold this posture; ``None`` if unknown.
     """

@@ -83,7 +83,7 @@ class ImpactBounds(Constraint):
 
     @property
     def unknowns(self) -> int:
-        # Without friction, the impulse adds one unknown.  With friction, it adds the six unknowns of CoulombKind.
+        # Without friction, the impulse adds one unknown.  With friction, it adds the six unknowns of ``CoulombKind``.
         return self._motion + (6 if self._slips else 1)
 
     @property

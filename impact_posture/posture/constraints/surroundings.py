@@ -176,7 +176,7 @@ class Surroundings:
         return constraints
 
     def fixed_at(self, q: Array) -> Surroundings:
-        """Return these surroundings with surfaces that stay in the world where they are at ``q``, shape (nq,)."""
+        """Return a copy whose surfaces stay fixed in the world where they are at the posture ``q``, shape (nq,)."""
         fixed, numeric = copy(self), self._moving.at(q)
         fixed.__dict__.pop("constraints", None)
         fixed._walls = []

@@ -42,6 +42,6 @@ def impact_constraints(
             added += [KeptContacts(single, numeric, requirements.friction, name) for single in member.singles]
         limits = requirements.largest_mass, requirements.largest_jump
         bounds = [ImpactBounds(single, *limits, name) for single in member.singles]
-        # ImpactBounds has no rows if the settings limit nothing, or if all joints are locked.
+        # ``ImpactBounds`` has no rows if the settings limit nothing, or if all joints are locked.
         added += [bound for bound in bounds if bound.rows]
     return added

@@ -52,10 +52,10 @@ _REDRAWN = (0.1, 0.2, 0.3, 0.5)
 # Share of the hops that take these values from another optimum.  The other hops draw random values.
 _CROSSED = 0.6
 # Distance (rad, m) below which two final postures are the same optimum if their merits differ by less than
-# SAME_VALUE.
+# ``SAME_VALUE``.
 _SAME = 0.05
-# The search stops when this number of random postures and hops from worse ends reached the best merit, and if the
-# next three values allow it.
+# The search stops when this number of random postures and hops from worse ends reached the best merit, and if
+# ``_FREE``, ``_ENDS`` and ``_IDLE`` allow it.
 _HITS = 12
 # Degrees of freedom up to which ``_HITS`` suffices.  Each further degree doubles the number, because the number of
 # optima grows exponentially with the degrees of freedom.
@@ -125,8 +125,8 @@ class _Search:
         self._manifold = self.descent.manifold
         self.ends = Ends(np.zeros((0, self._manifold.chart.nx)), np.zeros(0), np.zeros(0, dtype=int))
         self._problem, self._initial, self._rng = problem, initial, np.random.default_rng([seed, 2])
-        # For each optimum: an end, the merit and the embedded posture there, the number of random postures that
-        # reached it, and the number of hops from it.
+        # For each optimum: the index of a descent that ended there, the merit and the embedded posture of this end,
+        # the number of random postures that reached the optimum, and the number of hops from the optimum.
         self._end, self._merit = np.zeros(0, dtype=int), np.zeros(0)
         self._points = np.zeros((0, self._manifold.embed(self.ends.x).shape[1]))
         self._hits, self._tries = np.zeros(0, dtype=int), np.zeros(0, dtype=int)
@@ -165,7 +165,7 @@ class _Search:
             self._hits[same[0]] += ends.tag[k] == _RANDOM
 
     def settled(self, least: int) -> bool:
-        """Return whether the best merit was reached often enough, and early enough."""
+        """Return whether the best merit was reached ``_HITS`` times or more, and not only by the last descents."""
         merit, tag = self.ends.merit, self.ends.tag
         if len(merit) < least:
             return False
@@ -175,7 +175,7 @@ class _Search:
         return hits >= enough and bool(best.argmax() < (1 - _IDLE) * len(merit))
 
     def result(self) -> Screening:
-        """Return the guesses and the hits of all ends."""
+        """Return the result: the guesses, their hits, and the hits of all optima."""
         order = np.argsort(self._merit, kind="stable")
         projector, guesses = Projector(self._problem), dict[int, Array]()
         partial = not all(isinstance(c, ExpressionConstraint) for c in self._problem.constraints)
@@ -192,7 +192,7 @@ class _Search:
         )
 
     def _hop(self, other: Array) -> tuple[Array, NDArray[np.int_]]:
-        """Return good ends with some joints as at other ends or in ``other``, shape (N, nx), and their indices."""
+        """Return final postures with some joints from others or from ``other``, shape (N, nx), and their indices."""
         rng, count = self._rng, len(other)
         rank = np.argsort(np.argsort(self._merit))
         weight = (1 + rank) ** -_RANKED / (1 + self._tries / _TIRED) ** 2
