@@ -106,7 +106,7 @@ def parameters(s: Structure, period: float) -> Iterator[Field]:
             ("com_margin", "nonnegative", "distance of the center of mass from the edges of the support polygon, m"),
             ("tilt", "amount", "largest tilt of the base from the default posture, rad"),
             ("share", "share", "share of the actuators' limits that static controls may use"),
-            ("haste", "share", "share of the remaining control range for accelerations; (1 + haste)/2 for braking"),
+            ("haste", "share", "fraction of the remaining control range for accelerations; (1 + haste)/2 to brake"),
             ("tracking", "amount", "joint error at which the motion stops and waits, rad or m"),
         ):
             yield field(f"flow_{name}", rule, f"{text}, of the flow", getattr(s.flow.options, name))  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""Robot, problems and nonlinear programs of one case of a sweep, which each worker process builds once."""
+"""Robot, problems and nonlinear programs of one :class:`Case` of a sweep; each worker process builds them once."""
 
 from __future__ import annotations
 

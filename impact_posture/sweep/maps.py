@@ -50,7 +50,7 @@ class Shown:
         points: Number of problems of the sweep.
         counts: Number of solved points of each status.
         switches: Number of pairs of neighboring points in the maps that have different optima.
-        best: Axis values and objective of the best point of each case.
+        best: Axis values and objective of the best point of each case (:class:`Case`).
         files: Paths of the written figures.
     """
 
@@ -174,7 +174,7 @@ def _switches(postures: Sequence[Sequence[Array | None]], problem: ConstrainedPr
 
 
 def _best(data: Any, grid: Grid, number: int, values: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return a list with the point of a case that has the smallest objective; empty if no point is certified."""
+    """Return a list with the point of least objective in a case; the list is empty if no point is certified."""
     from pyarrow import compute
 
     least = (np.inf, -1)

@@ -23,7 +23,7 @@ from impact_posture.system.arrays import Array
 # A worker process with several threads solves one shard at a time, because MUMPS, the linear solver in IPOPT, is not
 # thread-safe.
 _ALONE = threading.Lock()
-# Number of cases whose robots and programs stay in the memory of a worker.
+# Number of cases (:class:`Case`) whose robots and programs stay in the memory of a worker.
 _KEPT = 4
 _KEPT_WALKS = 64
 _SOLVERS: OrderedDict[tuple[str, int], CaseSolver] = OrderedDict()

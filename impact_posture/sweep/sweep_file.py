@@ -145,7 +145,7 @@ class Sweep:
 
     @property
     def shards(self) -> int:
-        """Number of shards of the sweep.  All points of a shard belong to the same case."""
+        """Number of shards of the sweep.  All points of a shard belong to the same :class:`Case`."""
         return len(self.cases) * self.shards_of_case
 
     @property

@@ -55,7 +55,7 @@ class SweepManifest(StrictTable):
         points: Number of problems.
         shards: Number of shards.
         shard: Number of points of a shard.
-        cases: Cases of the sweep.
+        cases: The cases of the sweep, which are combinations of values of the outer axes.
         axes: Axes of the grid, the same for every case.
         checksum: SHA-256 of all other bytes of the file; empty in folders of schema 1.
     """

@@ -43,7 +43,7 @@ class Status(Enum):
     """Result of a tick."""
 
     SOLVED = "solved"
-    """All constraints hold, and strict levels hold as far as their rank permits (``Report.deficient``)."""
+    """All constraints hold, and strict levels of tasks hold as far as their rank permits (``Report.deficient``)."""
     RELAXED = "relaxed"
     """A strict level does not hold, because limits prevent it (``Report.relaxed``)."""
     INFEASIBLE = "infeasible"

@@ -111,7 +111,7 @@ def aerial_formulation(
         tilt: Task of the tilt; by default, a tilt task with ``kp = 100``.
         order: With ``strict``, tilt and end effector are equality constraints (Problems 2 and 3).  With ``weighted``,
             all tasks are in the cost, with their weights (Problem 1).
-        law: Law of the joint limits.
+        law: Law that stops joints at their limits (:class:`LimitLaw`).
 
     Raises:
         InputError: The robot does not fly, or has no default contact frame.
@@ -169,7 +169,7 @@ def legged_formulation(
         contacts: Contacts with the ground; by default, the robot's supports.
         force_point: Point, not at a foot, where a measured contact force acts.  With ``None``, the dynamics ignore
             measured forces.
-        law: Law of the joint limits.
+        law: Law that stops joints at their limits (:class:`LimitLaw`).
 
     Raises:
         InputError: The robot has no supports.

@@ -145,7 +145,7 @@ def compiled_source(objective: WorstCaseObjective) -> Iterator[Source]:
 
 
 def _impulse(objective: WorstCaseObjective) -> WorstCaseObjective:
-    """Return the objective with kind ``impulse``, which is defined everywhere.  ``H`` and ``∇H`` stay the same."""
+    """Return the objective of the type ``impulse``, which is defined at every posture and has the same ``H``."""
     return replace(objective, kind="impulse")
 
 

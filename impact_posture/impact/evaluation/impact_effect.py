@@ -73,7 +73,7 @@ def tangent_units(robot: Robot) -> tuple[str, ...]:
 def impact_effect(robot: Robot, velocity: Array) -> ImpactEffect:
     """Return base and worst joint of the velocity jump ``velocity``, shape (nv,).
 
-    For several velocity jumps, shape (n, nv), return the largest sizes of each part.
+    For several velocity jumps, shape (n, nv), return the largest size of each quantity over all jumps.
     """
     jumps = np.atleast_2d(velocity)
     linear, angular = (float(np.linalg.norm(jumps[:, part], axis=1).max()) for part in (slice(3), slice(3, 6)))

@@ -27,7 +27,7 @@ _CONVERGED = 1e-10
 _LONGEST_STEP = 0.5
 # Weight of the squared violation of an inequality in the merit of a posture, 1/m² or 1/rad².
 _PENALTY = 200.0
-# Share of the random postures near a given posture.
+# Fraction of the random postures that are drawn near a given posture.
 _NEAR = 0.25
 
 

@@ -1,11 +1,11 @@
-"""Screen many random postures by batch descents, hop from good ends, and choose the starts of IPOPT.
+"""Screen many random postures by batch descents, hop from good final postures, and choose the starts of IPOPT.
 
 The objective at a posture hardly predicts the optimum to which a descent leads, so each posture descends first
 (:mod:`impact_posture.posture.manifold.batch_descent`).  A hop takes the posture where a good descent ended, gives
 other values to some joints, and descends again (D. J. Wales and J. P. K. Doye, "Global optimization by
 basin-hopping", J. Phys. Chem. A 1997), because many optima differ in a few joints only.  Hops from the best optimum
-alone seldom reach another optimum.  The hops that reach a better optimum often start from worse ends.  No limit is a
-time, so a seed determines the result.
+alone seldom reach another optimum.  The hops that reach a better optimum often start from worse final postures.  No
+limit is a time, so a seed determines the result.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ _CROSSED = 0.6
 # Distance (rad, m) below which two final postures are the same optimum if their merits differ by less than
 # ``SAME_VALUE``.
 _SAME = 0.05
-# The search stops when this number of random postures and hops from worse ends reached the best merit, and if
-# ``_FREE``, ``_ENDS`` and ``_IDLE`` allow it.
+# The search stops when this number of random postures and hops from worse final postures reached the best merit, and
+# if ``_FREE``, ``_ENDS`` and ``_IDLE`` allow it.
 _HITS = 12
 # Degrees of freedom up to which ``_HITS`` suffices.  Each further degree doubles the number, because the number of
 # optima grows exponentially with the degrees of freedom.
@@ -64,8 +64,8 @@ _FREE = 5
 _ENDS = 256
 # The search stops only if the last descents, this fraction of all ended descents, did not lower the best merit.
 _IDLE = 0.5
-# Number of starts of IPOPT, half of them at the best ends and half at the most different good ends.  If descents
-# ignored no constraint, a third suffices.
+# Number of starts of IPOPT: half of them at the best final postures, half at the most different good final postures.
+# If descents ignored no constraint, a third suffices.
 _GUESSES = 12
 # Limit of the number of starts times the degrees of freedom, because a solution takes longer for large robots.
 _SOLVED = 200

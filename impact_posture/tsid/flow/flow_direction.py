@@ -55,8 +55,8 @@ class FlowOptions:
         com_margin: Distance of the center of mass from the edges of the support polygon, m.
         tilt: Largest angle between the vertical and :attr:`~impact_posture.robot.robot.Robot.upright`, rad.
         share: Share of the actuators' limits that the static controls at ``q_r`` may use.
-        haste: The static controls leave a part of the control ranges.  Accelerations may use the share ``haste`` of
-            this part.  Braking before a limit may use the share ``(1 + haste)/2``.
+        haste: Fraction of the control ranges left by the static controls that accelerations may use.  Braking before
+            a limit may use the fraction ``(1 + haste)/2``.
         tracking: If the joints of the robot lag behind ``q_r`` by this error, rad (m), the flow stops and waits.
     """
 

@@ -82,7 +82,7 @@ class StaticControls:
         """Return the share of the acceleration ``more``, 0 to 1, that the actuators permit.
 
         The acceleration ``known``, shape (nv,), cannot be changed.  The static controls ``shares``, shape (m,), leave
-        a part of the control ranges.  The sum of both accelerations may use the share ``most`` of this part.  The
+        a part of the control ranges.  The sum of both accelerations may use the fraction ``most`` of this part.  The
         contact forces follow from the last call of :meth:`shares`.
         """
         self._pair[:, 0], self._pair[:, 1] = known, more
