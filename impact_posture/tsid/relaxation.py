@@ -13,7 +13,7 @@ from impact_posture.tsid.qp.daqp_solver import SETTINGS, SOLVED, DaqpSolver
 from impact_posture.tsid.qp.hierarchy import Level, lexicographic
 from impact_posture.tsid.qp.quadratic_program import EQUALITY, QP, Solved
 
-# A row counts as satisfied if its error is below this share of the sum of its absolute terms.
+# A row counts as satisfied if its error is below this fraction of the sum of its absolute terms.
 OFF = 1e-6
 # A row that violates a bound by more than this keeps its value while the cost is minimized.  The violation is
 # relative to the norm of the row times the norm of z.
@@ -22,7 +22,7 @@ _MISSES = 1e-9
 _ROUNDING = 1e-13
 # ``_FAR`` is a bound that DAQP treats as infinite.  ``_SETTINGS`` are the DAQP settings of :func:`_cheapest`.
 _FAR, _SETTINGS = 1e30, SETTINGS | {"primal_tol": 1e-11}
-# Curvatures of the cost below this share of the largest curvature are raised to this share.
+# Curvatures of the cost below this fraction of the largest curvature are raised to this fraction.
 _FLATTEST = 1e-14
 # Weight of the proximal-point term with which DAQP checks whether the strict priority levels are feasible.
 _FLAT = 1e-6

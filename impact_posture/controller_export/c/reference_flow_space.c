@@ -244,7 +244,7 @@ static void ip_flow_polygon(ip_context *c)
     for (j = 0; j < 2; ++j) {
       x[i][j] += even * (mean[i % 4][j] - x[i][j]);
     }
-    /* Start at the leftmost corner.  If several corners are leftmost, start at the lowest, which is an end of an edge. */
+    /* Start at the leftmost corner.  If several are leftmost, start at the lowest, which is the end of an edge. */
     start = x[i][0] < x[start][0] - IP_ON_LINE || (x[i][0] <= x[start][0] + IP_ON_LINE && x[i][1] < x[start][1]) ? i
                                                                                                                 : start;
   }

@@ -22,14 +22,14 @@ from impact_posture.tsid.state import State
 LEAST_VALUE = 1e-8
 # Below this sine of the tilt angle, the tilt axis is undefined, and the slope of the tilt is set to zero.
 LEVEL = 1e-6
-# Largest violation of a limit during braking, rad (m) for joints, and a share of the range for static controls.
+# Largest violation of a limit during braking, rad (m) for joints, and a fraction of the range for static controls.
 NEAR = 1e-3
 # The flow may move along a limit that it violates by less than this, in the units of ``NEAR``.  If this value equaled
 # ``NEAR``, the flow would slowly cross the limit.
 SPENT = 9.9e-4
 # Distance that the flow keeps from the joint limits, rad (m).
 AIM = 2e-3
-# Distance that the flow keeps from the limits of the static controls, as a share of the range.  This distance is
+# Distance that the flow keeps from the limits of the static controls, as a fraction of the range.  This distance is
 # larger than ``AIM``, because the slope of the static controls is only estimated.
 RESERVE = 8e-3
 # A row of the limits is ignored if the square of its length along the free directions is smaller than this.

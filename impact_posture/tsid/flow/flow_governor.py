@@ -13,8 +13,8 @@ from impact_posture.tsid.flow.zero_moment_point import ZeroMomentPoint
 
 # Attempts per candidate of `change`: first unchanged, then twice without the part that crosses limits.
 ATTEMPTS = 3
-# The flow assumes a share of the largest acceleration for braking.  This share is at least ``ABLE``, and increases
-# by at most ``ABLE`` per change.
+# The flow assumes a fraction of the largest acceleration for braking.  This fraction is at least ``ABLE``, and
+# increases by at most ``ABLE`` per change.
 ABLE = 0.1
 # Safety factor of the braking time, because the slopes of the limits change during braking.
 CAUTION = 1.5
@@ -103,7 +103,7 @@ class FlowGovernor:
     def take(self, change: Array, part: float) -> Array:
         """Add ``part`` times ``change`` to the velocity, and return this product, shape (nv,).
 
-        ``part`` is the share of the change that the actuators permit, 0 to 1.
+        ``part`` is the fraction of the change that the actuators permit, 0 to 1.
         """
         self._able = min(max(part, ABLE), self._able + ABLE)
         change = change * part

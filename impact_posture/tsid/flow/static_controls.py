@@ -16,14 +16,14 @@ from impact_posture.tsid.support_contact import SupportContact
 
 # Weight of a moment (N·m), relative to a force (N), in the norm of contact wrenches.
 MOMENT = 100.0
-# Accelerations may use at least this share of the half range of a control, even if the static controls leave less.
+# Accelerations may use at least this fraction of the half range of a control, even if the static controls leave less.
 LEFT = 0.1
-# Each of n soles carries at least this share of the weight, divided by n.
+# Each of n soles carries at least this fraction of the weight, divided by n.
 EVEN = 0.6
 # If the direction of an edge is within this angle of −π, rad, the edge is sorted as if its direction were +π.
 _START = 1e-8
-# This share of the trace is added to the diagonal of the equations of the contact wrenches.  The equations are then
-# solvable even if the feet cannot carry every wrench on the base.
+# This fraction of the trace is added to the diagonal of the equations of the contact wrenches.  The equations are
+# then solvable even if the feet cannot carry every wrench on the base.
 TINY = 1e-12
 
 
@@ -79,7 +79,7 @@ class StaticControls:
         return np.asarray(self._needed(state.h) - self._central)
 
     def permitted(self, M: Array, known: Array, more: Array, shares: Array, most: float) -> float:
-        """Return the share of the acceleration ``more``, 0 to 1, that the actuators permit.
+        """Return the fraction of the acceleration ``more``, 0 to 1, that the actuators permit.
 
         The acceleration ``known``, shape (nv,), cannot be changed.  The static controls ``shares``, shape (m,), leave
         a part of the control ranges.  The sum of both accelerations may use the fraction ``most`` of this part.  The

@@ -14,8 +14,8 @@ from impact_posture.tsid.smooth_step import smooth
 # A direction is damped if its singular value, divided by the length of the level's longest row, is smaller than this.
 # In the home postures of all shipped robots, this ratio is above 0.03.
 SINGULAR = 2e-2
-# Directions are removed if their ratio (see ``SINGULAR``) is below this share of ``SINGULAR``.  The share is far
-# above rounding errors, but too small for a visible effect.
+# Directions are removed if their ratio (see ``SINGULAR``) is below this fraction of ``SINGULAR``.  This fraction is
+# far above rounding errors, but too small for a visible effect.
 DROPPED = 1e-9
 # Least ``1 − α``, which limits the weight ``α/(1 − α)`` of a damped row.
 LEAST = 1e-8
