@@ -84,7 +84,7 @@ def _head(page: Page, summary: dict[str, Any]) -> None:
     page.title(summary["name"], summary["description"])
     # With a fixed root, the mass excludes links that cannot move.  This text helps users who forgot
     # ``root = "free-flyer"``.
-    fixed = ", without what is fixed to the world" if summary["root"] == "fixed" else ""
+    fixed = ", without links that are fixed to the world" if summary["root"] == "fixed" else ""
     rows = [
         ("model", summary["source"]),
         ("root", f"{summary['root']}; nq {summary['nq']}, nv {summary['nv']}"),
@@ -154,7 +154,7 @@ def _frames(page: Page, summary: dict[str, Any]) -> None:
     page.title(f"Link frames ({len(links)})", "listed by the joint that moves them; frames of 'universe' never move")
     page.table(("moved by", "frames"), [(joint, ", ".join(names)) for joint, names in by_joint.items()])
     if not page.quiet:
-        page.line("  joints' own frames have the joints' names; --json lists every frame", style="dim")
+        page.line("  the frame of a joint has the name of the joint; --json lists every frame", style="dim")
 
 
 def _postures(page: Page, summary: dict[str, Any]) -> None:

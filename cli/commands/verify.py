@@ -73,7 +73,7 @@ def verify(
     if not report.passed:
         failed = [row for row in report.rows if row.verdict == "fail"]
         named = ", ".join(" ".join(filter(None, (row.source, row.quantity))) for row in failed)
-        complain(f"error: {impact.robot.name}: other numbers than Pinocchio's: {named}; please report it")
+        complain(f"error: {impact.robot.name}: numbers differ from Pinocchio: {named}; please report it")
         raise typer.Exit(1)
 
 

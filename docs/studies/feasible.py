@@ -56,7 +56,7 @@ def lines(request: Request) -> Iterator[str]:
     yield f"search, which repeats some starts. Both ratios are medians over {request.count} seeds. *certified* is"
     yield "the smallest number over the seeds, *left out* is the sum. All of these searches finish every start."
     yield "The default stops starts that can no longer become the best. *left*: number of stopped starts."
-    yield "*above*: increase of the best objective because of them. *time*: time of the default search, divided"
+    yield "*above*: increase of the best objective by stopping them. *time*: time of the default search, divided"
     yield "by the time with all starts. A dash: no posture satisfies the constraints, and the last column names"
     yield "the conflict."
     yield machine()

@@ -47,7 +47,7 @@ def lines(request: Request) -> Iterator[str]:
     began = time.perf_counter()
     plan = {s: controllers_of(s, False) for s in scenarios}
     main = reproduce(plan, seeds=request.count, **shared)
-    say(f"\nthe first part took {time.perf_counter() - began:.0f} s without the kept runs")
+    say(f"\nthe first part took {time.perf_counter() - began:.0f} s, without the stored runs")
     every = reproduce({s: controllers_of(s, True) for s in scenarios}, seeds=OTHERS, **shared)
     yield "\n\n".join(_parts(main, every))
     if request.write:

@@ -219,7 +219,7 @@ def _struck(
 
 
 def _led(start: Array, run: RunUp, limits: ActuatorLimits, seed: int, effort: int) -> tuple[RunUp, str] | str:
-    """Return a run-up with a motion from the start to it, and the method of the search; or why it has none."""
+    """Return a run-up preceded by a motion from the start, and the search method; or why no such motion exists."""
     space, motion = run.spaces.approach, run.motion
     here = run.spaces.begin(start)
     if here is None:

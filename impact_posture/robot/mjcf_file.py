@@ -224,13 +224,14 @@ def _check_tree(model: Any, path: Path) -> None:
             raise MjcfError(fault, where=str(path), hint=f"give coordinates up to {FARTHEST:g} m")
     free = np.flatnonzero(model.jnt_type == import_mujoco().mjtJoint.mjJNT_FREE)
     if free.size and (free.size > 1 or free[0]):
-        fault = f"body '{object_name(model, 'body', int(model.jnt_bodyid[free[-1]]))}' floats beside other joints"
+        name = object_name(model, "body", int(model.jnt_bodyid[free[-1]]))
+        fault = f"body '{name}' floats in addition to the robot"
         hint = "remove it in a copy of the file, or put the floating robot first; or name the robot without its scene"
         raise MjcfError(fault, where=str(path), hint=hint)
 
 
 def _tendon_terms(model: Any, k: int) -> dict[int, float]:
-    """Return joint → ``c`` of a tendon equality ``Σ c (q − q⁰) = a₀`` with up to two joints; empty for all others."""
+    """Return joint → factor ``c`` for a tendon equality ``Σ c (q − q⁰) = a₀`` of up to two joints, else nothing."""
     mujoco, terms = import_mujoco(), dict[int, float]()
     curved = model.eq_obj2id[k] >= 0 and model.eq_data[k, 2:5].any()
     if curved or not model.eq_type[k] == mujoco.mjtEq.mjEQ_TENDON:

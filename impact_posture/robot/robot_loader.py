@@ -95,7 +95,7 @@ def build_robot(located: Located, options: LoadOptions) -> Robot:
         locked = tuple(dict.fromkeys((*locked, *massless)))
     beside = _beside(model) if root == "free-flyer" else ()
     if beside:
-        warnings = (*warnings, f"joints that do not hang on the floating base are locked: {listed(beside)}")
+        warnings = (*warnings, f"joints that are not attached to the floating base are locked: {listed(beside)}")
         locked = tuple(dict.fromkeys((*locked, *beside)))
     mjcf = None if described.mjcf is None else CompiledMjcf(described.mjcf, model, postures[default])
     locked = with_partners(couplings, locked)

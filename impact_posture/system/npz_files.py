@@ -43,7 +43,7 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
             arrays = {name: file[name] for name in file.files}
     except MemoryError:
         # The header of a small file may state any size.
-        raise ValueError(f"{path.name} states more numbers than it has") from None
+        raise ValueError(f"{path.name} states more numbers than it contains") from None
     except (BadZipFile, EOFError, RuntimeError, zlib.error) as error:
         # A RuntimeError means that the file has another compression or a password.
         raise ValueError(f"{path.name} is damaged: {error}") from None

@@ -240,7 +240,7 @@ def _check_ours(out: Path, kind: Kind) -> None:
     foreign = foreign_files(out)
     if foreign:
         fault = f"holds {listed(foreign, _SHOWN)}, which this command did not write"
-        hint = "choose another `out`, or move that away: `force` replaces earlier results only"
+        hint = "choose another `out`, or move these files away: `force` replaces only earlier results"
         raise OutputError(fault, where=str(out), hint=hint)
 
 

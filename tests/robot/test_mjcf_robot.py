@@ -257,7 +257,7 @@ def test_equal_tendons_of_two_joints_are_couplings(tmp_path: Path, equalities: s
         (_with(ARM, tendon=_THREE, equality='<tendon tendon1="cord"/>'), "(tendon) couples more than two joints"),
         (_with(ARM, tendon=_TENDON.format(' armature="1"')), "the armature of tendon 'cord' couples joints"),
         (QUADRUPED.replace("</worldbody>", '<body name="ball"><freejoint/><geom size=".1"/></body></worldbody>')
-         .replace("<key ", "<!--").replace('0 .5 .9 "/>', "-->"), "body 'ball' floats beside other joints"),
+         .replace("<key ", "<!--").replace('0 .5 .9 "/>', "-->"), "body 'ball' floats in addition to the robot"),
         ("<mujoco><worldbody/></mujoco>", "has no body"),
         ("<mujocoinclude><worldbody><body/></worldbody></mujocoinclude>", "name the file that includes"),
         ('<mujoco><worldbody><body><geom size="1"/></body></worldbody></mujoco>', "has no movable joint"),
@@ -275,10 +275,10 @@ def test_refusals_name_the_fault_in_one_line(tmp_path: Path, text: str, line: st
 
 
 def test_joints_beside_a_floating_robot_are_locked(tmp_path: Path) -> None:
-    """Some vendors keep the joints of optional parts by bodies that hang on the world."""
+    """Some vendors keep the joints of optional parts, with bodies that are attached to the world."""
     spare = '<body name="spare" pos="0 0 20"><joint name="gone"/><geom size=".1" mass=".001"/></body></worldbody>'
     robot, plain = loaded(tmp_path, QUADRUPED.replace("</worldbody>", spare)), loaded(tmp_path, QUADRUPED)
-    assert "joints that do not hang on the floating base are locked: gone" in robot.warnings
+    assert "joints that are not attached to the floating base are locked: gone" in robot.warnings
     assert robot.joint_names == plain.joint_names and robot.locked == ("gone",)
     q = plain.posture()
     ours, reference = (pin.crba(each.model, each.model.createData(), q) for each in (robot, plain))

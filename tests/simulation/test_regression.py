@@ -1,7 +1,7 @@
 """Nominal and robust controller in the shipped scenarios, with one contact or push, within bands.
 
-The bands contain the values of seeds 0 to 2 (talos: 0 and 1), and are a few times wider than their spread.  Therefore
-the bands tolerate another MuJoCo version, but reveal a change of a controller or a scenario.
+The bands contain the values of seeds 0 to 2 (talos: 0 and 1), and are a few times wider than the spread of these
+values.  Therefore the bands tolerate another MuJoCo version, but reveal a change of a controller or a scenario.
 """
 
 from __future__ import annotations

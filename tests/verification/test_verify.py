@@ -350,7 +350,7 @@ def test_a_failure_ends_with_exit_code_1_and_one_line(
     assert run(command, ["verify", "ur5", "--samples", "1", "--quiet"]) == 1
     shown = capsys.readouterr()
     assert "fail" in shown.out
-    assert shown.err.splitlines() == ["error: ur5: other numbers than Pinocchio's: CasADi G; please report it"]
+    assert shown.err.splitlines() == ["error: ur5: numbers differ from Pinocchio: CasADi G; please report it"]
     assert run(command, ["verify", "ur5", "--samples", "1", "--json"]) == 1
     shown = capsys.readouterr()
     assert json.loads(shown.out)["passed"] is False

@@ -54,7 +54,7 @@ def lines(request: Request) -> Iterator[str]:
     frictions, stiffnesses = (", ".join(f"{value:g}" for value in values) for values in (FRICTIONS, STIFFNESSES))
     yield f"Speed: 1 m/s. Friction: {frictions}. Stiffness: {stiffnesses} N/m. Before and after an optimization with"
     yield f"{request.count} starts and the objective `auto`."
-    for title, cases in (("Robots that the simulation was written with", CASES), ("Other robots", HELD_OUT)):
+    for title, cases in (("Robots with which the simulation was written", CASES), ("Other robots", HELD_OUT)):
         chosen = [case for case in cases if request.only in case.name]
         if chosen:
             yield from ("", f"### {title}", "")

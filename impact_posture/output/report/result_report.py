@@ -188,7 +188,7 @@ def _verdict(document: dict[str, Any]) -> tuple[str, ...]:
 
 
 def _before_and_after(prepared: Prepared, document: dict[str, Any]) -> Iterator[Table]:
-    """Yield a table for the first contact with the objective, and a table for each other contact."""
+    """Yield a table for the first contact, which includes the objective, and a table for each other contact."""
     blocks = [document[key] for key in ("initial", answer_key(document))]
     contacts = prepared.impact.objective.contacts
     for k, contact in enumerate(contacts):
