@@ -8,7 +8,7 @@ the order of joints.  The model has no geometry.  A simulation adds shapes with 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -56,6 +56,8 @@ class Mjcf:
         sites: Index of a frame → name of its site.  Of several frames with the same name, only one has a site.
         moments: Body name → principal moments of inertia that MuJoCo rejects, kg·m², shape (3,).  The spec contains
             the nearest accepted moments, and :meth:`compile` sets the exact moments.
+        inverse_weights: Body name → ``body_invweight0`` that :meth:`compile` sets, shape (2,): 1/kg and 1/(kg m²).
+            MuJoCo scales the softness of contacts with it.  ``None`` stands for the values of the parent body.
     """
 
     spec: Any
@@ -64,6 +66,7 @@ class Mjcf:
     joints: dict[int, tuple[str, ...]]
     sites: dict[int, str]
     moments: dict[str, Array]
+    inverse_weights: dict[str, Array | None] = field(default_factory=dict)
 
     def body(self, joint: int) -> Any:
         """Return the ``MjsBody`` that a Pinocchio joint moves; for :data:`WORLD`, the body of the world."""
@@ -115,6 +118,9 @@ class Mjcf:
             model.body_inertia[model.body(name).id] = moments
         if self.moments:
             mujoco.mj_setConst(model, mujoco.MjData(model))
+        for name, weights in self.inverse_weights.items():
+            parent = model.body_parentid[model.body(name).id]
+            model.body(name).invweight0 = model.body_invweight0[parent] if weights is None else weights
         return model
 
 

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 from impact_posture.errors import ImpactPostureError, JointLocked, NameNotFound, SpecError
+from impact_posture.impact.impact_contact import point_on
 from impact_posture.robot.actuation import allocation
 from impact_posture.robot.posture_files import read_posture, set_joints
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.simulation.scenario_file import Scenario, ScenarioTable
-from impact_posture.simulation.world.mjcf_contacts import contact_warnings
+from impact_posture.simulation.world.mjcf_contacts import contact_warnings, solid_links
+from impact_posture.simulation.world.scene import Shape
 from impact_posture.simulation.world.world import World, build_world
 from impact_posture.system.arrays import Array
 from impact_posture.system.progress import tell
@@ -26,7 +28,7 @@ class Setup:
     """Scenario that is ready to run.
 
     Attributes:
-        scenario: Content of the scenario file.
+        scenario: Content of the scenario file, with shapes for the feet of an MJCF.
         robot: Robot of the scenario.
         q: Start posture, shape (nq,).
         world: Simulated world before its first reset.
@@ -73,7 +75,19 @@ def set_up(scenario: Scenario) -> Setup:
         q = set_joints(robot, start, scenario.joints, scenario.source)
         q = robot.check_posture(q, where=scenario.source)
         robot.frame_id(scenario.task.frame)
+        scenario = replace(scenario, shapes=(*scenario.shapes, *_own_feet(scenario, robot)))
         return Setup(scenario, robot, q, build_world(robot, scenario, q, scenario.throw))
+
+
+def _own_feet(scenario: Scenario, robot: Robot) -> Iterator[Shape]:
+    """Yield a shape of kind ``link`` for each foot that has solid geoms in the MJCF and no shape in the scenario."""
+    shaped = {point_on(robot, shape.frame).joint for shape in scenario.shapes}
+    solid = {int(frame.parentJoint) for *_, frame, _ in solid_links(robot)}
+    for support in robot.spec.supports if scenario.control.footing is not None else ():
+        joint = point_on(robot, support.frame).joint
+        if joint in solid - shaped:
+            shaped.add(joint)
+            yield Shape(support.frame, kind="link", offset=support.offset)
 
 
 @contextmanager

@@ -57,7 +57,8 @@ def _parameters(setup: Setup, model: Any) -> Iterable[tuple[str, Iterable[float]
     yield "q", setup.q
     yield from _joints(setup)
     yield "effort", setup.world.limits.effort
-    yield "shapes", [model.geom(name).id for name in built.shape_geoms]
+    yield "shapes", [model.geom(name).id for names in built.shape_geoms for name in names]
+    yield "shape_of", [k for k, names in enumerate(built.shape_geoms) for _ in names]
     propulsion = robot.spec.propulsion
     if propulsion is not None:
         shares = -np.expm1(-step / np.array([propulsion.time_constant_up, propulsion.time_constant_down]))

@@ -13,12 +13,14 @@ import pytest
 from impact_posture.collision.mjcf_shapes import solid_geoms
 from impact_posture.dynamics.mjcf import Mjcf
 from impact_posture.dynamics.mjcf_layout import file_layout
+from impact_posture.errors import InputError
 from impact_posture.robot.model_joints import q_slice
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.simulation.outcome import doubts
+from impact_posture.simulation.recorder import feet_of
 from impact_posture.simulation.scenario_file import read_scenario
-from impact_posture.simulation.setup import set_up
+from impact_posture.simulation.setup import Setup, set_up
 from impact_posture.simulation.world.actuator_command import ActuatorCommand
 from impact_posture.simulation.world.mjcf_contacts import contact_warnings
 from impact_posture.simulation.world.scene import Physics, Scene, Shape, Surface
@@ -39,6 +41,11 @@ LAWS = (
     .replace(
         "</contact>", '<pair geom1="palm" geom2="foot" condim="4" friction=".3 .4 .1 .2 .3" margin=".02"/></contact>'
     )
+)
+FIELD = ARM.replace(
+    "<worldbody>",
+    """<asset><hfield name="h" nrow="3" ncol="4" size=".4 .6 .3 .1" elevation="0 1 2 3 1 .5 .2 1 2 2 .3 .1"/></asset>
+    <worldbody><geom type="hfield" hfield="h" pos=".2 0 -.1" euler="0 0 20"/>""",
 )
 WEDGES = MESH.replace('<geom type="mesh" mesh="wedge" contype="0" conaffinity="0"/>', """
         <body name="third" pos="-.3 0 0"><joint name="three" axis="0 1 0" range="-180 180"/>
@@ -63,7 +70,7 @@ SLIDES = """
   <contact>{}</contact>
 </mujoco>
 """
-SETS = {"arm": ARM, "quadruped": QUADRUPED, "odd": ODD, "laws": LAWS, "wedges": WEDGES}
+SETS = {"arm": ARM, "quadruped": QUADRUPED, "odd": ODD, "laws": LAWS, "wedges": WEDGES, "field": FIELD}
 
 
 def loaded(folder: Path, text: str, **options: Any) -> Robot:
@@ -178,18 +185,103 @@ def test_links_without_shapes_touch_surfaces(tmp_path: Path, frame: str) -> None
     assert impulse[2] > 0.1 if frame == "trunk" else not impulse.any()
 
 
-def test_height_fields_and_replaced_options_are_named(tmp_path: Path) -> None:
-    text = ARM.replace(
-        "<worldbody>",
-        '<option integrator="RK4" timestep=".001"><flag contact="disable"/></option>'
-        '<asset><hfield name="h" nrow="2" ncol="2" size="1 1 .1 .1"/></asset>'
-        '<worldbody><geom type="hfield" hfield="h" pos="0 0 -1"/>',
-    )
+STANDING = """
+name = "standing"
+robot = "own.xml"
+{shapes}
+[physics]
+timestep = 0.0005
+
+[[surfaces]]
+name = "floor"
+normal = [0, 0, 1]
+point = [0, 0, 0]
+friction = 0.8
+solref = [0.004, 1.0]
+solimp = [0.95, 0.99, 0.001]
+
+[push]
+frame = "trunk"
+force = [5, 0, 0]
+
+[control]
+period = 0.001
+[control.posture]
+kp = 50
+[control.footing]
+friction = 0.5
+[control.robust]
+gain = 10
+"""
+FEET = ("foot_fl", "foot_fr", "foot_hl", "foot_hr")
+
+
+def standing(folder: Path, text: str, shapes: str = "") -> Setup:
+    (folder / "own.xml").write_text(text)
+    (folder / "robot.toml").write_text("".join(f'[[supports]]\nframe = "{foot}"\n' for foot in FEET))
+    (folder / "mine.toml").write_text(STANDING.format(shapes=shapes))
+    return set_up(read_scenario(folder / "mine.toml"))
+
+
+def test_a_robot_lands_on_its_feet_as_in_its_file(tmp_path: Path) -> None:
+    """A quadruped falls 2 cm onto its feet, with the geoms of the MJCF, beside MuJoCo with the file itself."""
+    law = '<default><geom friction=".8" solref=".004 1" solimp=".95 .99 .001"/>'
+    text = QUADRUPED.replace("<default>", law, 1)
+    setup = standing(tmp_path, text)
+    assert feet_of(setup) == FEET
+    assert len(setup.world.built.shape_geoms[0]) == 2, "capsule and ball of a shin"
+    source = mujoco.MjModel.from_xml_string(text)
+    source.opt.timestep, source.opt.integrator = 5e-4, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    source.opt.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    source.jnt_solref[:], source.jnt_solimp[:, :3] = (0.005, 1.0), (0.95, 0.99, 0.001)
+    data = mujoco.MjData(source)
+    q = setup.q.copy()
+    q[2] += 0.02 - min(setup.world.built.gaps.values())
+    setup.world.reset(q)
+    assert setup.robot.mjcf is not None
+    data.qpos[:] = file_layout(setup.robot.mjcf.joints).qpos(q)
+    torque, landed = np.tile([0.0, -1.0, 1.0], 4), False
+    data.qfrc_applied[6:] = torque
+    for _ in range(8):
+        setup.world.step(ActuatorCommand(torque, np.zeros(0)), 50)
+        mujoco.mj_step(source, data, 50)
+        truth = setup.world.truth()
+        assert np.abs(file_layout(setup.robot.mjcf.joints).qpos(truth.q) - data.qpos).max() < 1e-9
+        landed = landed or all(shape.touching for shape in truth.shapes)
+    mass = float(source.body_mass.sum())
+    assert landed and sum(shape.impulse[2] for shape in truth.shapes) > 0.5 * mass * 9.81 * 0.1
+
+
+def test_a_shape_of_the_scenario_replaces_the_geoms_of_a_foot(tmp_path: Path) -> None:
+    sphere = '[[shapes]]\nframe = "foot_hl"\nsize = [0.03]\ncenter = [0, 0, 0]'
+    setup = standing(tmp_path, QUADRUPED, sphere)
+    kinds = {shape.frame: shape.kind for shape in setup.scenario.shapes}
+    assert kinds == {"foot_hl": "sphere", "foot_fl": "link", "foot_fr": "link", "foot_hr": "link"}
+    data = setup.robot.model.createData()
+    pin.framesForwardKinematics(setup.robot.model, data, setup.q)
+    for foot in FEET:
+        at = data.oMf[setup.robot.frame_id(foot)]
+        radius, center = (0.03, at.translation) if foot == "foot_hl" else (0.025, at.act(np.array([0, 0, 0.025])))
+        assert setup.world.built.gaps["floor", foot] == pytest.approx(center[2] - radius, abs=1e-12)
+
+
+def test_a_shape_of_kind_link_needs_geoms_and_no_sizes(tmp_path: Path) -> None:
+    for wrong in ({"size": (0.1,)}, {"center": (0.0, 0.0, 0.0)}):
+        with pytest.raises(InputError, match="leave it out"):
+            Shape("tip", kind="link", **wrong)
+    bare = QUADRUPED.replace('size=".25 .1 .05"', 'size=".25 .1 .05" contype="0" conaffinity="0"')
+    robot = loaded(tmp_path, bare)
+    with pytest.raises(InputError, match="its link has no solid geoms"):
+        build_scene(robot, Scene((FLOOR,), (Shape("trunk", kind="link"),)), robot.posture())
+
+
+def test_replaced_options_are_named(tmp_path: Path) -> None:
+    options = '<option integrator="RK4" timestep=".001"><flag contact="disable"/></option>'
+    text = ARM.replace("<worldbody>", f"{options}<worldbody>")
     for content, lines in (
         (ARM, []),
-        (text, ["the simulation leaves out height fields and signed distance fields of the MJCF (1)",
-                "the scenario replaces these options of the MJCF: timestep, integrator, disableflags"]),
-    ):  # fmt: skip
+        (text, ["the scenario replaces these options of the MJCF: timestep, integrator, disableflags"]),
+    ):
         robot = loaded(tmp_path, content)
         mjcf: Mjcf = build_scene(robot, Scene(), robot.posture()).mjcf
         assert list(contact_warnings(mjcf, robot)) == lines

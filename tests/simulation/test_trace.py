@@ -70,7 +70,7 @@ def test_a_trace_has_the_state_of_every_tick(name: str, monkeypatch: pytest.Monk
 def test_forces_agree_with_mujoco() -> None:
     world, commands = shaken("solo8-push")
     model, data, copy = world._model, world._data, mujoco.MjData(world._model)
-    shape_of = {model.geom(name).id: k for k, name in enumerate(world.built.shape_geoms)}
+    shape_of = {model.geom(name).id: k for k, (name,) in enumerate(world.built.shape_geoms)}
     pushed = 0
     for command in commands:
         mujoco.mj_copyData(copy, model, data)

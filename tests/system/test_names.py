@@ -263,7 +263,7 @@ def test_mujoco_loads_a_scene_with_these_names(arm: Robot) -> None:
         surface = Surface(name, (0.0, 0.0, 1.0), gap=0.1)
         built = build_scene(robot, Scene((surface,), (Shape(name, (0.01,)),)), robot.posture())
         model = built.mjcf.compile()
-        assert (model.npair, model.ngeom) == (1, 2) and model.geom(built.shape_geoms[0]).id >= 0, ascii(name)[:60]
+        assert (model.npair, model.ngeom) == (1, 2) and model.geom(built.shape_geoms[0][0]).id >= 0, ascii(name)[:60]
 
 
 # ---- pictures -----------------------------------------------------------------------------------------------------

@@ -64,13 +64,13 @@ class _Mark(NamedTuple):
 class ContactLog:
     """Contacts of all steps since the last call of :meth:`look`, with accumulated impulses and peaks."""
 
-    def __init__(self, model: Any, geoms: tuple[str, ...]) -> None:
+    def __init__(self, model: Any, geoms: tuple[tuple[str, ...], ...]) -> None:
         self._count, self._step = len(geoms), float(model.opt.timestep)
         # In a contact with a plane, MuJoCo lists the plane first, so the contact force acts on the second geom.  A
         # ball can be the first or the second geom.
         self._shape_of = np.full(model.ngeom, -1)
-        for k, name in enumerate(geoms):
-            self._shape_of[model.geom(name).id] = k
+        for k, names in enumerate(geoms):
+            self._shape_of[[model.geom(name).id for name in names]] = k
         self._body_of, self._root_of = np.array(model.geom_bodyid), np.array(model.body_rootid)
         self.reset()
 

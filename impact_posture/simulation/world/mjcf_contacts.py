@@ -1,4 +1,4 @@
-"""Contacts between links as the MJCF of a robot defines them, in the world that MuJoCo simulates."""
+"""Solid geoms of links as the MJCF of a robot defines them, in the world that MuJoCo simulates."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
+import pinocchio as pin
 
 from impact_posture.collision.mjcf_shapes import excluded_pairs, mesh_surface, solid_geoms
 from impact_posture.dynamics.mjcf import Mjcf, pose
@@ -30,33 +31,49 @@ class LinkGeom(NamedTuple):
     joint: int
 
 
+def solid_links(robot: Robot) -> Iterator[tuple[int, str, pin.Frame, list[int]]]:
+    """Yield number, name, frame and solid geoms of each body of the MJCF of a robot that has solid geoms.
+
+    Signed distance fields are left out.  Without an MJCF, there are no bodies.
+    """
+    if robot.mjcf is None:
+        return
+    source = robot.mjcf.model
+    for b, geoms in solid_geoms(source):
+        link = object_name(source, "body", b)
+        if usable := [g for g in geoms if not _is_distance_field(source, g)]:
+            yield b, link, robot.model.frames[robot.frame_id(link) if b else 0], usable
+
+
 def add_link_geoms(mjcf: Mjcf, robot: Robot) -> dict[str, LinkGeom]:
     """Add solid geoms, excluded pairs of bodies and contact pairs from the MJCF of a robot; return the geoms by name.
 
-    Each body of the file becomes a body without mass, fixed to the joint that moves it.  Height fields and signed
-    distance fields are left out.  Without an MJCF, nothing is added.
+    Each body of the file becomes a body without mass, fixed to the joint that moves it.  Its contacts are as soft as
+    in the file.  If joints are locked, the contacts of a body are as soft as contacts of its joint.
     """
     if robot.mjcf is None:
         return {}
     mujoco, source = import_mujoco(), robot.mjcf.model
     names, bodies, added = dict[int, str](), dict[int, str](), dict[str, LinkGeom]()
-    for b, geoms in solid_geoms(source):
-        link = object_name(source, "body", b)
-        frame = robot.model.frames[robot.frame_id(link)] if b else robot.model.frames[0]
-        usable = [g for g in geoms if not _is_field(source, g)]
-        if not usable:
-            continue
+    for b, link, frame, geoms in solid_links(robot):
         bodies[b] = xml_name(f"geoms of {link} ({b})")
         body = mjcf.body(frame.parentJoint).add_body(name=bodies[b], **pose(frame.placement))
-        for g in usable:
+        mjcf.inverse_weights[bodies[b]] = None if robot.locked else np.array(source.body_invweight0[b])
+        for g in geoms:
             names[g] = xml_name(f"geom {g} of {link}")
             added[names[g]] = LinkGeom(link, frame.parentJoint)
             law = {key: getattr(source, f"geom_{key}")[g] for key in _GEOM}
-            at = pose(placement(source.geom_pos[g], source.geom_quat[g]))
+            at, k = pose(placement(source.geom_pos[g], source.geom_quat[g])), int(source.geom_dataid[g])
             if source.geom_type[g] == mujoco.mjtGeom.mjGEOM_MESH:
-                convex, points = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX, _hull(source, source.geom_dataid[g])
-                mjcf.spec.add_mesh(name=names[g], uservert=points.ravel(), inertia=convex)
+                convex = mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX
+                mjcf.spec.add_mesh(name=names[g], uservert=_hull(source, k).ravel(), inertia=convex)
                 law["meshname"] = names[g]
+            elif source.geom_type[g] == mujoco.mjtGeom.mjGEOM_HFIELD:
+                rows, columns = int(source.hfield_nrow[k]), int(source.hfield_ncol[k])
+                heights = source.hfield_data[source.hfield_adr[k] :][: rows * columns]
+                size = source.hfield_size[k]
+                mjcf.spec.add_hfield(name=names[g], nrow=rows, ncol=columns, size=size, userdata=heights)
+                law["hfieldname"] = names[g]
             body.add_geom(name=names[g], type=source.geom_type[g], size=source.geom_size[g], mass=0.0, **law, **at)
     # Locked joints merge bodies.  Therefore, exclude each pair of bodies that are next to each other in the file.
     mjcf.spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_FILTERPARENT
@@ -79,8 +96,8 @@ def contact_warnings(mjcf: Mjcf, robot: Robot) -> Iterator[str]:
     if robot.mjcf is None:
         return
     source, usual = robot.mjcf.model, import_mujoco().MjSpec().option
-    if absent := sum(_is_field(source, g) for _, geoms in solid_geoms(source) for g in geoms):
-        yield f"the simulation leaves out height fields and signed distance fields of the MJCF ({absent})"
+    if absent := sum(_is_distance_field(source, g) for _, geoms in solid_geoms(source) for g in geoms):
+        yield f"the simulation leaves out signed distance fields of the MJCF ({absent})"
     stated = [
         name
         for name in _OPTIONS
@@ -90,9 +107,8 @@ def contact_warnings(mjcf: Mjcf, robot: Robot) -> Iterator[str]:
         yield f"the scenario replaces these options of the MJCF: {', '.join(stated)}"
 
 
-def _is_field(model: Any, g: int) -> bool:
-    types = import_mujoco().mjtGeom
-    return bool(model.geom_type[g] == types.mjGEOM_HFIELD or model.geom_type[g] == types.mjGEOM_SDF)
+def _is_distance_field(model: Any, g: int) -> bool:
+    return bool(model.geom_type[g] == import_mujoco().mjtGeom.mjGEOM_SDF)
 
 
 def _hull(model: Any, mesh: int) -> Array:

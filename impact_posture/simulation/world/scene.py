@@ -12,7 +12,7 @@ from impact_posture.errors import InputError
 from impact_posture.impact.impact_contact import LARGEST
 from impact_posture.simulation.world.contact_law import ContactLaw
 
-ShapeKind = Literal["sphere", "box"]
+ShapeKind = Literal["sphere", "box", "link"]
 _Normal = Annotated[
     Vector3,
     Demand(
@@ -48,25 +48,29 @@ class Shape(StrictTable):
     Attributes:
         frame: Frame to which the shape is fixed.  The shape has the same name.
         size: Radius of a sphere, or three half extents of a box, m.
-        kind: ``sphere``, or ``box`` with its edges along the axes of the frame.
+        kind: ``sphere``; ``box`` with its edges along the axes of the frame; or ``link``, the solid geoms that the
+            MJCF of the robot has at the link of the frame.
         offset: Contact point in the coordinates of the frame, m.
-        center: Center of the shape in the coordinates of the frame, m.  By default, the center follows from
+        center: Center of a sphere or box in the coordinates of the frame, m.  By default, the center follows from
             ``offset``.  ``offset`` is then the point of the sphere, or the middle of the face of the box, that is
             nearest to the surface :meth:`Scene.faced` in the start posture.
     """
 
     frame: str
-    size: tuple[Positive, ...]
+    size: tuple[Positive, ...] = ()
     kind: ShapeKind = "sphere"
     offset: FiniteVector = (0.0, 0.0, 0.0)
     center: FiniteVector | None = None
 
     def __post_init__(self) -> None:
-        """Check that ``size`` has one number for a sphere and three for a box."""
-        count, words = (1, "a radius") if self.kind == "sphere" else (3, "three half extents")
+        """Check that ``size`` has one number for a sphere and three for a box, and that a link has neither."""
+        count, words = {"sphere": (1, "a radius"), "box": (3, "three half extents"), "link": (0, "empty")}[self.kind]
+        where = f"{self.kind} at '{self.frame}'"
         if len(self.size) != count:
-            what, hint = f"size {list(self.size)} is not {words}", f"give {words} above zero (m)"
-            raise InputError(what, where=f"{self.kind} at '{self.frame}'", hint=hint)
+            hint = f"give {words} above zero (m)" if count else "leave it out, because the geoms have their own sizes"
+            raise InputError(f"size {list(self.size)} is not {words}", where=where, hint=hint)
+        if self.kind == "link" and self.center is not None:
+            raise InputError("has a center", where=where, hint="leave it out, because the MJCF places the geoms")
 
 
 @checked

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
+from itertools import chain
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
 from impact_posture.collision.coal_geometry import read_shapes
+from impact_posture.collision.contact_front import rigid_silhouettes
 from impact_posture.collision.mesh_file import UnusableShape
 from impact_posture.collision.shape_corners import shape_points
 from impact_posture.collision.urdf_shapes import largest_extent
@@ -32,6 +35,8 @@ from impact_posture.system.optional_package import import_mujoco
 
 # Joint families whose velocities have the same meaning in Pinocchio and MuJoCo.
 _DRIVEN = ("revolute", "continuous", "prismatic", "translation", "spherical")
+# Function from a unit normal to the lowest point of a shape against this normal, world, m.
+_Lowest = Callable[[Array], Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +49,7 @@ class BuiltScene:
         normals: Unit normal of each surface, by name.
         points: Point on each surface, world, m, by name.
         gaps: Pair (surface, shape) → distance of the shape from the surface in the start posture, m.
-        shape_geoms: Name of the geom of each shape, in the order of the shapes in the scene.
+        shape_geoms: Names of the geoms of each shape, in the order of the shapes in the scene.
         rotor_link: Points whose hull contains the link with the rotors, in the frame of its joint, shape (k, 3), m;
             empty without rotors.
         link_geoms: Name of each geom from the MJCF of the robot → its link.
@@ -55,7 +60,7 @@ class BuiltScene:
     normals: Mapping[str, Array]
     points: Mapping[str, Array]
     gaps: Mapping[tuple[str, str], float]
-    shape_geoms: tuple[str, ...]
+    shape_geoms: tuple[tuple[str, ...], ...]
     rotor_link: Array
     link_geoms: Mapping[str, LinkGeom]
     throw: Throw | None = None
@@ -69,8 +74,8 @@ def build_scene(robot: Robot, scene: Scene, q: Array, throw: Throw | None = None
     Raises:
         FrameNotFound: The frame of a shape does not exist.
         ContactError: The frame of a shape is welded to the world.
-        InputError: MuJoCo is not installed, a shape without a center has no surface to determine the center, or a
-            surface without a point has no shape to determine the point.
+        InputError: MuJoCo is not installed, a shape without a center has no surface to determine the center, a
+            surface without a point has no shape to determine the point, or a link has no solid geoms.
         UnsupportedJoint: The robot has a joint that no MuJoCo motor can drive.
     """
     numeric = Numeric(robot.model).at(q)
@@ -79,22 +84,25 @@ def build_scene(robot: Robot, scene: Scene, q: Array, throw: Throw | None = None
     _set_passive(mjcf, robot)
     mjcf.couple_joints(robot)
     normals = {s.name: np.array(s.normal, dtype=float) / np.linalg.norm(s.normal) for s in scene.surfaces}
-    geoms, placed = [], []
+    links = add_link_geoms(mjcf, robot)
+    geoms, lowest = list[tuple[str, ...]](), dict[str, _Lowest]()
     for shape in scene.shapes:
-        faced = scene.faced(shape)
-        placement = _placement(robot, numeric, shape, None if faced is None else normals[faced.name])
-        joint = point_on(robot, shape.frame).joint
-        geoms.append(xml_name(f"shape {shape.frame}"))
-        mjcf.add_geom(joint, geoms[-1], shape.kind, shape.size, placement)
-        placed.append((shape, numeric.data.oMi[joint] * placement))
-    points = {s.name: _point(s, normals[s.name], placed) for s in scene.surfaces}
+        faced, joint, name = scene.faced(shape), point_on(robot, shape.frame).joint, xml_name(f"shape {shape.frame}")
+        if shape.kind == "link":
+            geoms.append(_add_link(mjcf, links, joint, name))
+            lowest[shape.frame] = partial(_lowest_of_link, robot, joint, numeric.data.oMi[joint])
+        else:
+            placement = _placement(robot, numeric, shape, None if faced is None else normals[faced.name])
+            geoms.append((name,))
+            mjcf.add_geom(joint, name, shape.kind, shape.size, placement)
+            lowest[shape.frame] = partial(_lowest, shape, numeric.data.oMi[joint] * placement)
+    points = {s.name: _point(s, normals[s.name], lowest.values()) for s in scene.surfaces}
     gaps = {
-        (name, shape.frame): float(normals[name] @ (_lowest(shape, placement, normals[name]) - point))
+        (name, frame): float(normals[name] @ (lowest_point(normals[name]) - point))
         for name, point in points.items()
-        for shape, placement in placed
+        for frame, lowest_point in lowest.items()
     }
     hulls, rotor_link = _add_rotor_link(mjcf, robot)
-    links = add_link_geoms(mjcf, robot)
     if robot.floating:
         # A link with a shape of the scenario touches surfaces only with this shape.  Links of a robot with a fixed
         # base do not touch surfaces, because a surface may cut the base.
@@ -103,7 +111,7 @@ def build_scene(robot: Robot, scene: Scene, q: Array, throw: Throw | None = None
     for surface in scene.surfaces:
         name = xml_name(f"surface {surface.name}")
         mjcf.add_plane(name, points[surface.name], normals[surface.name])
-        for geom in (*geoms, *hulls):
+        for geom in (*chain(*geoms), *hulls):
             _add_pair(mjcf, name, geom, surface)
     if throw is not None:
         add_ball(mjcf, throw)
@@ -111,6 +119,21 @@ def build_scene(robot: Robot, scene: Scene, q: Array, throw: Throw | None = None
     _add_rotors(mjcf, robot)
     _add_motors(mjcf, robot)
     return BuiltScene(mjcf, normals, points, gaps, tuple(geoms), rotor_link, links, throw)
+
+
+def _add_link(mjcf: Mjcf, links: Mapping[str, LinkGeom], joint: int, name: str) -> tuple[str, ...]:
+    """Add copies of the solid geoms of a link that touch only surfaces, and return their names."""
+    names = []
+    for geom in (mjcf.spec.geom(geom) for geom, link in links.items() if link.joint == joint):
+        names.append(f"{name} ({geom.name})")
+        geom.parent.add_geom(
+            name=names[-1], type=geom.type, size=geom.size, meshname=geom.meshname,
+            pos=geom.pos, quat=geom.quat, mass=0.0, contype=0, conaffinity=0,
+        )  # fmt: skip
+    if not names:
+        hint = "give it a sphere or a box, or take an MJCF in which geoms of the link collide"
+        raise InputError("its link has no solid geoms", where=name, hint=hint)
+    return tuple(names)
 
 
 def _add_rotor_link(mjcf: Mjcf, robot: Robot) -> tuple[list[str], Array]:
@@ -191,15 +214,15 @@ def _placement(robot: Robot, numeric: Numeric, shape: Shape, normal: Array | Non
     return frame * pin.SE3(np.eye(3), np.array(shape.offset, dtype=float) + rise)
 
 
-def _point(surface: Surface, normal: Array, placed: list[tuple[Shape, pin.SE3]]) -> Array:
+def _point(surface: Surface, normal: Array, lowest: Collection[_Lowest]) -> Array:
     """Return a point of a surface.  By default, the surface is at the distance ``gap`` from the nearest shape."""
     if surface.point is not None:
         return np.array(surface.point, dtype=float)
-    if not placed:
+    if not lowest:
         what = "has neither a point nor a shape that determines the point"
         raise InputError(what, where=f"surface '{surface.name}'", hint="give a point, or a shape")
-    lowest = min((_lowest(*each, normal) for each in placed), key=lambda point: float(normal @ point))
-    return np.asarray(lowest - surface.gap * normal)
+    nearest = min((point(normal) for point in lowest), key=lambda point: float(normal @ point))
+    return np.asarray(nearest - surface.gap * normal)
 
 
 def _lowest(shape: Shape, placement: pin.SE3, normal: Array) -> Array:
@@ -208,6 +231,17 @@ def _lowest(shape: Shape, placement: pin.SE3, normal: Array) -> Array:
     if shape.kind == "box":
         reach = float(np.abs(placement.rotation.T @ normal) @ np.array(shape.size))
     return np.asarray(placement.translation - reach * normal)
+
+
+def _lowest_of_link(robot: Robot, joint: int, placement: pin.SE3, normal: Array) -> Array:
+    """Return the lowest point (against the normal) of the shapes that a joint moves."""
+    down = -placement.rotation.T @ normal
+    shapes = [shape for shape in rigid_silhouettes(robot, joint) if shape.joint == joint]
+    if not shapes:
+        what = f"the shapes that '{robot.model.names[joint]}' moves cannot be used"
+        raise InputError(what, where=robot.name, hint="see the warnings of `inspect`, or use a sphere or a box")
+    points = np.vstack([shape.foremost(down) for shape in shapes])
+    return np.asarray(placement.act(points[(points @ down).argmax()]))
 
 
 def _add_rotors(mjcf: Mjcf, robot: Robot) -> None:

@@ -83,8 +83,10 @@ public:
     // diverged state.
     mju_user_warning = [](const char *) {};
     shape_of_.assign(std::size_t(model_->ngeom), -1);
-    for (double geom : given_.row("shapes", 0)) {
-      shape_of_.at(std::size_t(geom)) = int(shapes_++);
+    const auto &geoms = given_.row("shapes", 0), &shapes = given_.row("shape_of", 0);
+    for (std::size_t k = 0; k < geoms.size(); ++k) {
+      shape_of_.at(std::size_t(geoms[k])) = int(shapes[k]);
+      shapes_ = std::size_t(shapes[k]) + 1;
     }
     rotors_ = given_.has("rotors") ? std::size_t(given_.number("rotors")) : 0;
     smoothing_ = given_.has("force_shape") ? given_.number("force_smoothing") : 0;
@@ -198,6 +200,9 @@ private:
         continue;
       }
       const int one = shape_of_[std::size_t(contact.geom[0])], other = shape_of_[std::size_t(contact.geom[1])];
+      if (one < 0 && other < 0) {
+        continue; // the links of an MJCF touch each other
+      }
       const std::size_t shape = std::size_t(one > other ? one : other);
       mjtNum force[3], local[3] = {};
       mju_copy(local, data_->efc_force + contact.efc_address, contact.dim == 3 ? 3 : 1);
