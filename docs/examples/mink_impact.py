@@ -94,7 +94,6 @@ def run(speed: float = 10.0) -> Outcome:
 
 
 def main() -> Outcome:
-    """Run mink and print the result."""
     outcome = run()
     print(f"effective mass {outcome.mass[0]:.4g} → {outcome.mass[-1]:.4g} kg in {len(outcome.mass) - 1} ticks")
     print(f"the tool was off by {outcome.error:.1e} at most, speed at the end {outcome.speed:.1e}")

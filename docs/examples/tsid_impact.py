@@ -89,7 +89,6 @@ def run() -> Outcome:
 
 
 def main() -> Outcome:
-    """Run the example and print the results."""
     outcome = run()
     H = outcome.H
     print(f"H {H[0]:.6g} → {H[-1]:.6g} ({100 * (H[-1] / H[0] - 1):+.1f} %) in {DURATION:g} s")

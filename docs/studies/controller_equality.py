@@ -106,7 +106,6 @@ class Agreement:
     reference: float = 0.0
 
     def row(self, name: str, kind: str) -> list[str]:
-        """Return a row of the table."""
         other = ", ".join(f"{count} {pair}" for pair, count in sorted(self.other.items())) or "none"
         ours, theirs = (
             f"{violation:.0e}, {optimality:.0e}" + (f" ({wrong} not right)" if wrong else "")

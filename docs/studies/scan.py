@@ -78,7 +78,6 @@ def lines(request: Request) -> Iterator[str]:
 
 
 def _caption(scans: Mapping[str, Sequence[Place]]) -> Iterator[str]:
-    """Return the caption of the picture."""
     if ARM in scans:
         fine = [p for p in scans[ARM] if p.status == "completed"]
         start = min(fine, key=lambda p: abs(p.at - _SHIPPED))

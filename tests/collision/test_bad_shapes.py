@@ -33,7 +33,6 @@ SHOULDER = joint("shoulder", "base middle", at="0 0 0.3")
 
 
 def shaped(name: str, *geometries: str, tag: str = "collision") -> str:
-    """Return a link with shapes."""
     return link(name, 1, more="".join(f"<{tag}><geometry>{geometry}</geometry></{tag}>" for geometry in geometries))
 
 

@@ -104,7 +104,6 @@ OUTPUTS = (
 
 
 def compare(symbolic: Symbolic, q: Vector, generator: np.random.Generator) -> None:
-    """Compare every quantity at one configuration with Pinocchio."""
     model, frame = symbolic.model, symbolic.frame
     v, u, tau = (generator.normal(size=model.nv) for _ in range(3))
     w = generator.normal(size=6)

@@ -1,4 +1,4 @@
-"""Commands replace only files that they wrote and that nobody changed since; for other files they ask for --force."""
+"""Commands replace only files that they wrote and that nobody changed later; other files require --force."""
 
 from __future__ import annotations
 

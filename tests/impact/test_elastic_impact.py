@@ -37,7 +37,6 @@ STEP = 2e-4
 
 
 def on_springs(loaded: Robot, table: TransmissionSpec) -> Robot:
-    """Return the robot with another ``[transmission]``."""
     return replace(loaded, spec=replace(loaded.spec, transmission=table))
 
 

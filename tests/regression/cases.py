@@ -42,7 +42,6 @@ class Case:
 
     @property
     def settings(self) -> ProblemSettings:
-        """Settings of the problem that the command solves."""
         robot = str(ROOT / self.robot) if self.robot.endswith(".urdf") else self.robot
         return make_settings(
             {"robot": robot, "frame": self.frame, "normal": self.normal, "collision": True, "holdable": True}

@@ -41,7 +41,6 @@ def test_result_is_still_an_optimum(case: Case) -> None:
 
 
 def check(case: Case, prepared: Prepared, q: Array) -> None:
-    """Check the committed values of a posture."""
     expected = json.loads(EXPECTED.read_text())[case.name]
     assert prepared.impact.robot.model_sha256 == expected["model_sha256"], "the robot's data changed: make regression"
     assert expected["command"] == case.command

@@ -41,7 +41,6 @@ KINDS: tuple[ObjectiveKind, ...] = ("impulse", "speed", "sticking", "energy")
 
 
 def stated(loaded: Robot, **table: object) -> Robot:
-    """Return the robot with another ``[transmission]`` table."""
     return replace(loaded, spec=replace(loaded.spec, transmission=TransmissionSpec(**table)))  # type: ignore[arg-type]
 
 

@@ -49,7 +49,6 @@ class SyntheticWorld:
 
 
 def recording(name: str, metric: Callable[[Any], float]) -> tuple[Recorder, SyntheticWorld]:
-    """Return a recorder and its synthetic world."""
     setup = shared_factory(name).setup
     recorder, world = Recorder(setup, metric), SyntheticWorld(setup)
     recorder._world = world  # type: ignore[assignment]

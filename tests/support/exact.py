@@ -43,7 +43,6 @@ def exact(values: object) -> Exact:
 
 
 def rounded(values: Exact) -> Vector:
-    """Round to doubles."""
     return np.asarray(values, dtype=float)
 
 

@@ -46,7 +46,6 @@ def random_configurations(model: pin.Model, count: int, *key: object, spread: fl
 
 
 def unit(generator: np.random.Generator, size: int = 3) -> Vector:
-    """Draw a unit vector."""
     v = generator.normal(size=size)
     return v / np.linalg.norm(v)
 

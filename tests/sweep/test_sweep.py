@@ -77,14 +77,12 @@ z = {{ from = -0.2, to = 0.2, count = 5 }}
 
 
 def write(text: str, folder: Path) -> Path:
-    """Write the text of a sweep file."""
     path = folder / "sweep.toml"
     path.write_text(text)
     return path
 
 
 def solve(text: str, folder: Path, executor: Any = None, name: str = "out", **options: Any) -> SweepRun:
-    """Run the sweep described by a text."""
     return run_sweep(read_sweep(write(text, folder)), folder / name, executor, **options)
 
 

@@ -141,7 +141,6 @@ def task_of(kind: str, link: int, name: str) -> Task:
 
 
 def turn_away(task: Task, by: Vector) -> None:
-    """Move the target of the given task."""
     task = task.inner if isinstance(task, Scaled) else task
     if isinstance(task, FramePosition):
         task.target = task.target + by[:3]

@@ -123,7 +123,6 @@ def frax(cases: list[Case]) -> Iterator[list[str]]:
 
 
 def main() -> int:
-    """Build and run all cases."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--build", default="", metavar="ARCHITECTURE")
     parser.add_argument("--only", default="", metavar="TEXT")

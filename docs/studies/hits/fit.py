@@ -167,7 +167,6 @@ class Fit:
         return self.summary(self.hits)
 
     def summary(self, hits: Sequence[Hit]) -> Summary:
-        """Return the medians of any group."""
         measured = summary(hits, self.arm)
         return replace(measured, jump=measured.recorded) if self.recorded else measured
 

@@ -91,7 +91,6 @@ class Evaluation:
 
     @cached_property
     def scores(self) -> dict[tuple[Group, str], Score]:
-        """Scores by group and prediction."""
         scores = {}
         for group, measured in self.measured.items():
             for name, jump in self.jumps(group).items():

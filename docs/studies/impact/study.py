@@ -68,7 +68,6 @@ class Outcome:
     coulomb: Vector  # predicted jump per unit approach speed with Coulomb friction of the surface
 
     def value(self, objective: str) -> float:
-        """Return the predicted value of an objective."""
         if objective == "coulomb":
             return float(self.coulomb @ self.coulomb)
         return float(getattr(self.predicted, OBJECTIVES[objective]))
@@ -118,7 +117,6 @@ class Row:
         return np.sort([o.ratio(objective) for o in self.outcomes])
 
     def measured(self, name: str) -> Vector:
-        """Return one measured quantity for all postures."""
         return np.array([getattr(o.measured, name) for o in self.outcomes])
 
     @property

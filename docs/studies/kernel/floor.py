@@ -6,10 +6,12 @@ and a general 2×2 matrix 4m 10a with the double angle (3m 2a for each joint).  
 axes requires no operation; any other is counted as one more plane rotation.  Translations are cross products with the
 nonzero numbers.  Each joint requires:
 
-- factorization: ``U = I^A S`` is a column, one reciprocal, ``U/D``, one triangle of ``I^a = I^A − U Uᵀ/D`` (its axis
-  row is zero without armature), ``I^a`` rotated, moved (``p̂A``, then ``p̂B`` and its partner on a triangle), added;
-- solve for a: biases inward on the contact's chain only, velocities outward; solve for b: biases from every joint;
-- gradient: the rows of ``f = I^a v⁻ + p^a`` that the axis row of ``v⁻ ×* f`` meets, for a and for b, and that row.
+- factorization: the column ``U = I^A S``, one reciprocal, ``U/D``, and one triangle of ``I^a = I^A − U Uᵀ/D``, whose
+  row of the joint axis is zero without armature.  ``I^a`` is rotated, moved by two products with ``p̂`` and added to
+  the parent;
+- solves: the solve for a passes biases inward along the chain of the contact, the solve for b from every joint.  Both
+  pass velocities outward;
+- gradient, for a and for b: the rows of ``f = I^a v⁻ + p^a`` that enter the axis row of ``v⁻ ×* f``, and this row.
 
 The base adds ``Rᵀn``, an LDLᵀ of a symmetric 6×6 and two solves with it.  The count ignores symmetric values, equal
 entries and constants that can be combined.  So a program can need fewer operations for some robots.
@@ -190,7 +192,8 @@ def _factorize(count: _Count, model: pin.Model, joints: dict[int, _Joint]) -> di
 
 
 def _inward(count: _Count, joints: dict[int, _Joint], active: set[int], loaded: set[int]) -> dict[int, Pattern]:
-    """Pass biases from the leaves inward over the ``active`` joints; an external force acts on ``loaded`` links."""
+    """Pass biases from the leaves inward along the ``active`` joints; an external force acts on the ``loaded``
+    links."""
     bias = {i: np.zeros(6, dtype=bool) for i in joints}
     for i in loaded & set(joints):
         bias[i][:] = True

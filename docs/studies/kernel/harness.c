@@ -17,7 +17,8 @@ static double now(void)
   return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
 }
 
-/* Return the seconds for each configuration.  Count calls that do not return zero in *failed.  `kind` is the kind of
+/* Return the seconds for each configuration.  Add to *failed the number of calls that do not return zero.  `kind` is
+the kind of
  * f: e(val), v(alue), b(atch), or d(ifferences).  For differences, q contains each configuration, followed by two
  * configurations for each direction, moved by +step and -step.
  */

@@ -78,7 +78,6 @@ class Record:
         return "" if status == "completed" else status
 
     def to_json(self) -> str:
-        """Convert the record to JSON text."""
         return json.dumps({"key": key(self.draw.scenario), **asdict(self)}, indent=1)
 
     @classmethod

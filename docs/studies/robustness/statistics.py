@@ -73,7 +73,6 @@ def change(record: Record, controller: str, metric: str = "q_total_impact") -> f
 
 
 def summarize(records: Sequence[Record], controller: str) -> Summary:
-    """Summarize a controller over all points."""
     records = tried(records)
     fine = [record for record in records if not record.failure(controller)]
     motion, recovery, jumps = (

@@ -18,7 +18,6 @@ class Range:
     scale: str = "linear"
 
     def draw(self, rng: np.random.Generator) -> float:
-        """Draw a random value from the range."""
         if self.scale == "sign":
             return self.low if rng.random() < 0.5 else self.high
         if self.scale == "log":
