@@ -161,6 +161,7 @@ def _tradeoff(page: Page, document: dict[str, Any], notes: list[str]) -> None:
 
 def _path(page: Page, path: dict[str, Any]) -> None:
     from impact_posture.path.follow_through import FACTORS, RESTITUTIONS
+    from impact_posture.path.strike import FREE_FALL
 
     page.gap()
     end = "the optimum" if path["found"] else f"objective {number(path['objective'])}"
@@ -182,9 +183,11 @@ def _path(page: Page, path: dict[str, Any]) -> None:
             page.line(f"  {number(strike['stated_speed'])} m/s is not possible, because of {strike['hindrance']}")
         after = strike["follow_through"]
         stops = f"then stops within {number(after['longest_s'])} s after {after['stopped']}"
+        # The feet of a robot that falls are pressed onto the ground, so only plastic impacts are considered.
+        rebounds = "" if path["timing"] == FREE_FALL else f" to {RESTITUTIONS[-1]:g}"
         page.line(
             f"  {stops if after['stopped'] else 'no stop along the velocity exists after any'} of {after['impacts']} "
-            f"considered impacts (restitution {RESTITUTIONS[0]:g} to {RESTITUTIONS[-1]:g}, "
+            f"considered impacts (restitution {RESTITUTIONS[0]:g}{rebounds}, "
             f"{FACTORS[0]:.0%} to {FACTORS[-1]:.0%} of the speed)"
         )
         for what, unit, room in (

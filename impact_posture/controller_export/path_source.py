@@ -13,6 +13,7 @@ from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.path.path_reference import PathReference
 from impact_posture.path.posture_path import PosturePath
 from impact_posture.path.row_interpolation import RowInterpolation
+from impact_posture.path.strike import FREE_FALL
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 from impact_posture.system.escape import c_comment
@@ -37,8 +38,8 @@ def render_path(s: Structure, reference: PathReference, prefix: str) -> dict[str
     """Return file name → text of ``<prefix>_path.h``, ``<prefix>_path.c`` and ``example.c``.
 
     Raises:
-        InputError: The path is for another robot, the path contains no motion, or the references of the controller
-            come from a reference flow.
+        InputError: The path is for another robot, the path contains no motion or a free fall, or the references of
+            the controller come from a reference flow.
     """
     path, strike = reference.path, reference.path.strike
     fault = ""
@@ -48,6 +49,8 @@ def render_path(s: Structure, reference: PathReference, prefix: str) -> dict[str
         fault, hint = f"has no motion ({path.reason or 'the start is the optimum'})", "leave the path out"
     elif s.flow is not None:
         fault, hint = "contradicts the reference flow, which moves the same references", "leave out one of them"
+    elif path.timing == FREE_FALL:
+        fault, hint = "is a free fall, but the feet of the controller stay on the ground", "leave the path out"
     if fault:
         raise InputError(fault, where="path", hint=hint)
     stop = strike and strike.follow_through and strike.follow_through.rows

@@ -18,7 +18,7 @@ from impact_posture.path.actuator_limits import ActuatorLimits
 from impact_posture.path.path_curve import PathCurve
 from impact_posture.path.path_space import PathSpace
 from impact_posture.path.row_interpolation import Moment, RowInterpolation
-from impact_posture.path.strike_spaces import StrikeSpaces
+from impact_posture.path.strike_spaces import StrikeSpaces, falls_freely, landed
 from impact_posture.path.stroke import shortest_stroke
 from impact_posture.path.time_law import TimeLaw
 from impact_posture.path.timed_curve import moment, sampled
@@ -58,8 +58,8 @@ class FollowThrough:
             known.
         rows: The motion from this velocity to rest; ``None`` if it does not exist.
         impacts: Number of considered impacts: the predicted impact, and all combinations of a restitution in
-            :data:`RESTITUTIONS`, a factor on the velocity in :data:`FACTORS`, and a normal (also on the edge of the
-            cone of normals).
+            :data:`RESTITUTIONS` (0 after a fall), a factor on the velocity in :data:`FACTORS`, and a normal (also on
+            the edge of the cone of normals).
         stopped: Number of these impacts after which a stop within the limits exists.
         longest_s: Duration of the longest of these stops, s.
         joints: Least distance from a joint limit; ``None`` without limits.
@@ -89,17 +89,17 @@ class FollowThrough:
 def after_impact(
     problem: ConstrainedProblem, spaces: StrikeSpaces, q: Array, velocity: Array, restitution: float
 ) -> Array | None:
-    """Return ``ν + (1 + e) M⁻¹Jᵀp``, shape (nv,), with the impulse ``p`` of a plastic impact with friction.
+    """Return ``ν + (1 + e) M⁻¹Jᵀp``, shape (nv,), with the impulses ``p`` of a plastic impact with friction.
 
-    The velocity before the impact need not be along the normal.  Return ``None`` if the iteration for ``p`` does not
-    converge.
+    All contacts strike at the same time.  The velocity before the impact need not be along the normals.  Return
+    ``None`` if the iteration for ``p`` does not converge.
     """
     impact = problem.impact
-    oracle = impact.oracle.at(q)
-    responses = oracle.solve(oracle.J.T)
-    normals, friction = spaces.normal[None], np.array([impact.contact.friction])
-    p = contact_impulses(oracle.J @ responses, (oracle.J @ velocity)[None], normals, friction)
-    return None if p is None else velocity + (1 + restitution) * responses @ p[0]
+    J = np.vstack([single.oracle.at(q).J for single in impact.singles])
+    responses = impact.oracle.at(q).solve(J.T)
+    friction = np.array([contact.friction for contact in impact.contacts])
+    p = contact_impulses(J @ responses, (J @ velocity).reshape(-1, 3), spaces.normals, friction)
+    return None if p is None else velocity + (1 + restitution) * responses @ p.ravel()
 
 
 def follow_through(
@@ -108,21 +108,27 @@ def follow_through(
     """Return the stop after the impact at ``q`` with the velocity ``ν``, shape (nv,), within the limits.
 
     Held joints and feet are assumed not to move.  The velocity after the impact may exceed the limits.
+
+    A robot that falls (:func:`~impact_posture.path.strike_spaces.falls_freely`) then stands on its contacts, and
+    ``limits`` are the limits of the standing robot (:func:`~impact_posture.path.strike_spaces.landed`).  A leg whose
+    foot rebounds presses it onto the ground again.  So only plastic impacts are considered after a fall.
     """
-    spaces = StrikeSpaces(problem, q)
-    around, cone, axes = {"": spaces}, np.deg2rad(problem.impact.normal_cone_deg), cone_axes(spaces.normal)
+    falls = falls_freely(problem)
+    standing, restitutions = (landed(problem, q), (0.0,)) if falls else (problem, RESTITUTIONS)
+    spaces = StrikeSpaces(standing, q)
+    around, cone, axes = {"": spaces}, np.deg2rad(problem.impact.normal_cone_deg), cone_axes(spaces.normals[0])
     for k in range(_EDGE if cone > 0 else 0):
         angle = 2 * np.pi * k / _EDGE
         tilted = axes @ [np.cos(cone), np.sin(cone) * np.cos(angle), np.sin(cone) * np.sin(angle)]
-        around[f", normal {k + 1} on the edge of the cone"] = StrikeSpaces(problem, q, normal=tilted)
-    spread = product(RESTITUTIONS, FACTORS, around.items())
-    impacts = {"the predicted impact": (spaces, 1.0, restitution)} | {
+        around[f", normal {k + 1} on the edge of the cone"] = StrikeSpaces(standing, q, normals=tilted[None])
+    spread = product(restitutions, FACTORS, around.items())
+    impacts = {"the predicted impact": (spaces, 1.0, 0.0 if falls else restitution)} | {
         f"restitution {e:g}, {factor:.0%} of the speed{where}": (at, factor, e) for e, factor, (where, at) in spread
     }
     predicted, rows, stops, hindrance = velocity, None, list[_Stop](), ""
     for k, (name, (at, factor, e)) in enumerate(impacts.items()):
         state = after_impact(problem, at, q, factor * velocity, e)
-        stop = "no impulse is known" if state is None else _stop(name, at, q, state, limits)
+        stop = "no impulse is known" if state is None else _stop(name, at, q, state, limits, falls)
         predicted = state if k == 0 and state is not None else predicted
         if isinstance(stop, str):
             hindrance = hindrance or f"{stop}, after {name}"
@@ -139,7 +145,7 @@ def follow_through(
         joints=_least(stops, lambda moment: _to_limits(spaces.rebound, moment[0])),
         clearance=_least(stops, lambda moment: _to_bodies(spaces.rebound, moment[0])),
         hindrance=hindrance,
-        center_of_pressure=_least(stops, _to_edges(problem, q, limits)),
+        center_of_pressure=_least(stops, _to_edges(standing, q, limits)),
     )
 
 
@@ -158,15 +164,23 @@ class _Stop:
         return (moment(self.curve, self.law, float(t)) for t in times)
 
 
-def _stop(impact: str, spaces: StrikeSpaces, q: Array, velocity: Array, limits: ActuatorLimits) -> _Stop | str:
+def _stop(
+    impact: str, spaces: StrikeSpaces, q: Array, velocity: Array, limits: ActuatorLimits, falls: bool
+) -> _Stop | str:
     """Return the shortest stop from a velocity, or why none exists.
 
-    Per length of the curve, the normal velocity of the contact point is constant, so the contact point rebounds.
+    Per length of the curve, the normal velocities of the contact points are constant, so contact points rebound.  If
+    the robot falls, the velocity of its center of mass is constant instead, so the feet only have to push.
     """
     space = spaces.rebound
     held = equality_jacobian(space.problem, Numeric(space.model).at(q))
     velocity = velocity - np.linalg.pinv(held, rcond=1e-9) @ (held @ velocity)
-    stroke, duration = shortest_stroke(space, q, velocity, spaces.rows(space), limits, before=False)
+
+    def rows(model: Numeric) -> Array:
+        return np.vstack([equality_jacobian(space.problem, model), model.center_of_mass()[1]])
+
+    along = rows if falls else spaces.rows(space)
+    stroke, duration = shortest_stroke(space, q, velocity, along, limits, before=False)
     if stroke.curve is None:
         return f"no stop along the velocity exists, because of {stroke.end}"
     if duration is None:

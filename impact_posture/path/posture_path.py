@@ -17,7 +17,8 @@ from impact_posture.path.path_space import PathSpace
 from impact_posture.path.path_timing import LimitUse, limit_use, timed
 from impact_posture.path.reachable_curve import ReachableCurve
 from impact_posture.path.row_interpolation import INTERPOLATION, RowInterpolation
-from impact_posture.path.strike import RunUp, Strike, check_strike, run_up
+from impact_posture.path.strike import FREE_FALL, RunUp, Strike, check_strike, run_up
+from impact_posture.path.strike_spaces import falls_freely, landed
 from impact_posture.path.timed_curve import TimedCurve
 from impact_posture.posture.approach.approach_speed import ApproachSpeed
 from impact_posture.posture.approach.attainable_speed import USABLE
@@ -48,8 +49,9 @@ class PosturePath(RowInterpolation):
         found: Whether the path ends at the optimum.
         reason: Why the path does not end at the optimum, and which limits the timing ignores; empty if neither
             applies.
-        method: Method of the search: ``continuation`` or ``sampling``; empty without a motion.
-        timing: ``time-optimal``, ``scaled`` or ``slowed``; empty without a motion.
+        method: Method of the search: ``continuation`` or ``sampling``; ``free fall`` without a search; empty without
+            a motion.
+        timing: ``time-optimal``, ``scaled``, ``slowed`` or ``free fall``; empty without a motion.
         objective: Objective at the end of the path.
         length: Tangent length of the path, rad mixed with m.
         max_violation: Largest violation of a constraint or joint limit at the postures.
@@ -123,7 +125,8 @@ def posture_path(
     If ``strike`` is given, the contact point arrives at the optimum with this speed, m/s
     (:mod:`~impact_posture.path.strike`).  If no optimum can be struck at this speed, the path strikes the optimum
     with the greatest speed.  If no optimum can be struck at all, the path ends at rest.  ``restitution`` is the
-    coefficient of the predicted impact, after which :mod:`~impact_posture.path.follow_through` stops the robot.
+    coefficient of the predicted impact, after which :mod:`~impact_posture.path.follow_through` stops the robot.  The
+    path of a robot that nothing holds up is its fall to the optimum.
 
     Raises:
         InputError: The package of the extra ``path`` is not installed, or the contact cannot strike.
@@ -133,6 +136,8 @@ def posture_path(
     space, limits = PathSpace(problem), ActuatorLimits(problem.objective, start, problem.requirements)
     if strike is not None:
         check_strike(problem, strike)
+        if falls_freely(problem):
+            limits = ActuatorLimits(landed(problem, start).objective, start, problem.requirements)
         struck = _struck(solution, space, limits, strike, restitution, seed, effort)
         if isinstance(struck, PosturePath):
             return struck
@@ -221,6 +226,8 @@ def _struck(
 def _led(start: Array, run: RunUp, limits: ActuatorLimits, seed: int, effort: int) -> tuple[RunUp, str] | str:
     """Return a run-up preceded by a motion from the start, and the search method; or why no such motion exists."""
     space, motion = run.spaces.approach, run.motion
+    if motion.method == FREE_FALL:
+        return run, FREE_FALL
     here = run.spaces.begin(start)
     if here is None:
         return _fault(space, start)

@@ -1,4 +1,4 @@
-"""The strike of a path: its velocity at the impact, and the run-up to this velocity."""
+"""The strike of a path: its velocity at the impact, and the run-up or the fall to this velocity."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from itertools import product
 
 import daqp
 import numpy as np
+import pinocchio as pin
 
 from impact_posture.config.json_block import JsonBlock
 from impact_posture.dynamics.numeric import Numeric
@@ -15,9 +16,10 @@ from impact_posture.impact.impact_contact import point_on
 from impact_posture.path.actuator_limits import ActuatorLimits
 from impact_posture.path.follow_through import FollowThrough
 from impact_posture.path.path_space import PathSpace
-from impact_posture.path.strike_spaces import StrikeSpaces
+from impact_posture.path.row_interpolation import RowInterpolation
+from impact_posture.path.strike_spaces import StrikeSpaces, falls_freely
 from impact_posture.path.stroke import SHORTEST, shortest_stroke
-from impact_posture.path.timed_curve import TimedCurve, sampled
+from impact_posture.path.timed_curve import SAMPLE_TIME, TimedCurve, sampled
 from impact_posture.posture.constraints.center_of_mass_over_feet import CenterOfMassOverFeet
 from impact_posture.posture.loads.holdable import Holdable, ReachableWrench
 from impact_posture.posture.program.certificate import linearized_limits
@@ -37,6 +39,12 @@ _ACTIVE = 1e-3
 _MISSED = 1e-9
 # Number of bisections for the greatest speed.
 _STEPS = 7
+# Ground is level if its unit normal differs from the vertical by less than this value.
+_TILT = 1e-9
+# Least number of rows of a fall.
+_LEAST_ROWS = 21
+# Method and timing of a path that is a fall.
+FREE_FALL = "free fall"
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,8 +54,8 @@ class Strike(JsonBlock):
     Attributes:
         speed: Speed at which the contact point arrives at the surface, m/s.
         stated_speed: Stated speed, m/s.
-        run_up_s: Time at which the run-up begins, from rest, s.
-        run_up_m: Length of the run-up along the normal, m.
+        run_up_s: Time at which the run-up or the fall begins, from rest, s.
+        run_up_m: Length of the run-up along the normal, or height of the fall, m.
         contact_s: Time of the contact, s.
         velocity: Generalized velocity at the contact, shape (nv,).
         share: Largest share of a velocity limit at the contact.
@@ -67,14 +75,20 @@ class Strike(JsonBlock):
 
 
 def check_strike(problem: ConstrainedProblem, speed: float) -> None:
-    """Raise ``InputError`` unless a single contact with a held position can arrive at a speed above zero, m/s."""
+    """Raise ``InputError`` unless contacts with held positions can arrive at a speed above zero, m/s.
+
+    A robot that falls freely can only land on level ground.
+    """
     fault, hint = "", "leave out `strike`"
-    if len(problem.objective.contacts) != 1:
-        fault = "several contacts cannot strike together"
-    elif (pose := problem.requirements.contact_pose) in ("free", "box"):
-        fault, hint = f"needs a held contact, but `contact_pose` is {pose}", "hold it: full, position or aligned"
+    wanted, gravity = problem.requirements, problem.robot.model.gravity.linear
+    normals = np.array([single.oracle.at(problem.given).n for single in problem.impact.singles])
+    loose = [pose for pose in (wanted.contact_pose, *wanted.other_poses) if pose in ("free", "box")]
+    if loose:
+        fault, hint = f"needs a held contact, but `contact_pose` is {loose[0]}", "hold it: full, position or aligned"
     elif not speed > 0:
         fault, hint = "needs an approach speed above zero", "give `speed`"
+    elif falls_freely(problem) and np.abs(normals + gravity / np.linalg.norm(gravity)).max() > _TILT:
+        fault, hint = "needs level ground, because nothing holds up the robot, so it falls", "give `support`"
     if fault:
         raise InputError(fault, where="strike", hint=hint)
 
@@ -123,18 +137,18 @@ def impact_velocity(
 ) -> tuple[Array, float] | None:
     """Return ``ν`` with ``Jν = −v n`` on the constraints of the run-up, and its largest share of a velocity limit.
 
-    The velocity minimizes the largest of ``|ν_i|/ν̄_i`` and, if ``balanced``, of the shares of :func:`_tipping`, plus
-    a small weight times ``Σ (ν_i/ν̄_i)²`` that makes it unique.  Entries without a limit count only in the sum, in
-    rad/s or m/s.  If possible, ``q − νt`` is within inequalities and joint limits to first order, where ``t`` is the
-    ``time``, s.  If not, the violation, relative to the distance from the bound, is as small as possible.  If
-    ``inside``, the robot comes from the inside of active bounds with :data:`_RATE`.  Return ``None`` if no velocity
-    exists.
+    All contacts arrive with the same speed, each along its normal.  The velocity minimizes the largest of
+    ``|ν_i|/ν̄_i`` and, if ``balanced``, of the shares of :func:`_tipping`, plus a small weight times ``Σ (ν_i/ν̄_i)²``
+    that makes it unique.  Entries without a limit count only in the sum, in rad/s or m/s.  If possible, ``q − νt`` is
+    within inequalities and joint limits to first order, where ``t`` is the ``time``, s.  If not, the violation,
+    relative to the distance from the bound, is as small as possible.  If ``inside``, the robot comes from the inside
+    of active bounds with :data:`_RATE`.  Return ``None`` if no velocity exists.
     """
     robot = spaces.run_up.problem.robot
     limited = np.isfinite(robot.velocity_limits)
     scale = np.where(limited, robot.velocity_limits, 1.0)
     A = spaces.rows(spaces.run_up)(Numeric(robot.model).at(q)) * scale
-    b = np.append(np.zeros(len(A) - 1), -speed)
+    b = np.where(np.arange(len(A)) < len(A) - len(spaces.normals), 0.0, -speed)
     least = np.linalg.pinv(A, rcond=1e-9) @ b
     if np.abs(A @ least - b).max() > _MISSED * speed:
         return None
@@ -170,7 +184,7 @@ class RunUp:
 
     Attributes:
         motion: Motion from rest to the impact.
-        strike: The impact; its times count from the beginning of the run-up.
+        strike: The impact; its times count from the beginning of the motion.
         spaces: The constraints before and after the impact.
     """
 
@@ -182,10 +196,12 @@ class RunUp:
 def run_up(problem: ConstrainedProblem, q: Array, speed: float, limits: ActuatorLimits) -> RunUp | str:
     """Return the shortest run-up to the stated speed at ``q``, or to the greatest speed; or why none exists.
 
-    The contact frame turns only if there are too few joints to prevent it.  The capture point of a robot that stands
+    The contact frames turn only if there are too few joints to prevent it.  The capture point of a robot that stands
     stays away from the edges of the feet, unless this bounds the speed.  If active bounds limit the speed, the robot
-    comes from the inside of these bounds.
+    comes from the inside of these bounds.  A robot that nothing holds up falls (:func:`_fall`).
     """
+    if falls_freely(problem):
+        return _fall(problem, q, speed)
     spaces, time = StrikeSpaces(problem, q), SHORTEST[limits.rotors] / 2
     fastest: RunUp | str = "the joints cannot move the contact along the normal"
     if impact_velocity(spaces, q, speed, time) is None:
@@ -198,6 +214,29 @@ def run_up(problem: ConstrainedProblem, q: Array, speed: float, limits: Actuator
         if isinstance(fastest, str) or (isinstance(run, RunUp) and run.strike.speed > fastest.strike.speed):
             fastest = run
     return fastest
+
+
+def _fall(problem: ConstrainedProblem, q: Array, speed: float) -> RunUp | str:
+    """Return the free fall from rest onto level ground in the posture ``q``; or what is in the way.
+
+    The joints are at rest, so ``J_i ν = −v n_i`` needs no share of a velocity limit.
+    """
+    spaces, (model, nv) = StrikeSpaces(problem, q), (problem.robot.model, problem.robot.nv)
+    gravity = np.array(model.gravity.linear)
+    end = speed / float(np.linalg.norm(gravity))
+    t = np.linspace(0.0, end, max(_LEAST_ROWS, int(np.ceil(end / SAMPLE_TIME)) + 1))
+    a = np.zeros(nv)
+    a[:3] = pin.XYZQUATToSE3(q[:7]).rotation.T @ gravity
+    postures = np.array([pin.integrate(model, q, -a * (end**2 - x**2) / 2) for x in t])
+    checked = [each for row in postures for each in spaces.approach.violations(row)]
+    if blocked := dict.fromkeys(name for name, size, tolerance in checked if size > tolerance):
+        return f"the fall violates: {', '.join(blocked)}"
+    rows, height = RowInterpolation(model, t, postures, np.outer(t, a), np.tile(a, (len(t), 1))), speed * end / 2
+    note = f"the robot begins to fall at rest, {height:.3g} m above the optimum"
+    strike = Strike(
+        speed=speed, stated_speed=speed, run_up_s=0.0, run_up_m=height, contact_s=end, velocity=rows.v[-1], share=0.0
+    )
+    return RunUp(TimedCurve(rows, FREE_FALL, (note,)), strike, spaces)
 
 
 def _timed_run_up(

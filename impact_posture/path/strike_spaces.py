@@ -1,4 +1,4 @@
-"""The constraints of a strike, for the motions before and after the impact."""
+"""The constraints of a strike at one or several contacts, for the motions before and after the impact."""
 
 from __future__ import annotations
 
@@ -8,10 +8,12 @@ from dataclasses import replace
 import numpy as np
 
 from impact_posture.dynamics.numeric import Numeric
+from impact_posture.impact.supports import resolve_supports
 from impact_posture.impact.worst_case.worst_normal import cone_axes
 from impact_posture.path.path_space import PathSpace
 from impact_posture.posture.constraints.center_of_mass_over_feet import CenterOfMassOverFeet
 from impact_posture.posture.constraints.clearance import Clearance
+from impact_posture.posture.constraints.constraint import Constraint
 from impact_posture.posture.constraints.pose_constraints import (
     AxisInCone,
     HeldOrientation,
@@ -20,8 +22,10 @@ from impact_posture.posture.constraints.pose_constraints import (
     HeldTurn,
     PositionAlong,
 )
+from impact_posture.posture.formulation.build_problem import held_support
 from impact_posture.posture.loads.holdable import Holdable, ReachableWrench
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem, equality_jacobian
+from impact_posture.robot.robot_spec import Support
 from impact_posture.system.arrays import Array
 
 # After the impact, the contact point may be this far inside the surface, m, because it may slide along the surface.
@@ -33,75 +37,106 @@ _POSES = (HeldPose, HeldPosition, HeldOrientation, AxisInCone)
 _AT_REST = (CenterOfMassOverFeet, Holdable, ReachableWrench)
 
 
+def falls_freely(problem: ConstrainedProblem) -> bool:
+    """Return whether a robot falls before the impact, because it has neither rotors, nor feet, nor a fixed base."""
+    robot = problem.robot
+    held = robot.spec.propulsion is not None or problem.objective.supports or problem.requirements.base == "fixed"
+    return robot.floating and not held
+
+
+def landed(problem: ConstrainedProblem, q: Array) -> ConstrainedProblem:
+    """Return the problem of a robot that stands on its contacts after a fall; the contact points stay as at ``q``."""
+    known, numeric = {s.frame: s for s in resolve_supports(problem.robot, None)}, Numeric(problem.robot.model).at(q)
+    feet = []
+    for contact in problem.objective.contacts:
+        foot = known.get(contact.frame, Support(contact.frame))
+        feet.append(foot if foot.has_sole else replace(foot, offset=contact.offset))
+    held = [held_support(problem.robot, numeric, foot) for foot in feet]
+    objective = replace(problem.impact, supports=tuple(feet))
+    return replace(problem, objective=objective, constraints=(*held, *problem.constraints), rows=())
+
+
 class StrikeSpaces:
     """The constraints of a strike at a posture ``q``, shape (nq,), for the motions before and after the impact.
 
-    The surface stays where it is at ``q``.  The contact point must not enter the surface.
+    The surfaces stay where they are at ``q``.  No contact point must enter its surface.
 
     Attributes:
-        normal: Normal of the surface at ``q``, world axes, shape (3,).
-        approach: Postures on the way to the run-up.  The orientation of the contact frame is held as at the optimum.
-        run_up: Postures of the run-up.  In addition, the contact point is on the normal through its place at ``q``.
+        normals: Normals of the m surfaces at ``q``, world axes, shape (m, 3).
+        approach: Postures on the way to the run-up.  The orientations of the contact frames are held as at the
+            optimum.  A robot that falls has no other held frames.
+        run_up: Postures of the run-up.  In addition, each contact point is on the normal through its place at ``q``.
         rebound: Postures after the impact, which moves all frames except the feet.  The center of mass may leave the
             feet while the robot moves, and the joint limits have no margin.
 
     Args:
-        turns: Whether the contact frame may turn in the run-up.
-        normal: Unit normal that replaces the normal of the contact, world axes, shape (3,).
+        turns: Whether the contact frames may turn in the run-up.
+        normals: Unit normals that replace the normals of the contacts, world axes, shape (m, 3).
     """
 
     def __init__(
-        self, problem: ConstrainedProblem, q: Array, *, turns: bool = False, normal: Array | None = None
+        self, problem: ConstrainedProblem, q: Array, *, turns: bool = False, normals: Array | None = None
     ) -> None:
-        oracle = problem.impact.oracle.at(q)
-        self._point, self.normal = oracle.point, oracle.n if normal is None else normal
-        tangents = cone_axes(self.normal)[:, 1:].T
-        first = len(problem.objective.supports)
-        # The constraint on the position comes first.  A constraint on the tilt may follow.
-        count = 2 if problem.requirements.contact_pose.startswith("aligned:") else 1
-        position, *tilt = problem.constraints[first : first + count]
-        turned = [] if turns else [position.orientation, *tilt] if isinstance(position, HeldPose) else tilt
+        oracles = [single.oracle.at(q) for single in problem.impact.singles]
+        self._points = [oracle.point for oracle in oracles]
+        self.normals = np.array([oracle.n for oracle in oracles]) if normals is None else normals
+        wanted, first = problem.requirements, len(problem.objective.supports)
+        poses, turned, end = dict[str, str](), list[Constraint](), first
+        for contact, pose in zip(problem.objective.contacts, (wanted.contact_pose, *wanted.other_poses), strict=True):
+            poses.setdefault(contact.frame, pose)
+        for pose in poses.values():
+            # The constraint on the position comes first.  A constraint on the tilt may follow.
+            position, *tilt = problem.constraints[end : end + 1 + pose.startswith("aligned:")]
+            turned += [position.orientation, *tilt] if isinstance(position, HeldPose) else tilt
+            end += 1 + len(tilt)
         still = {} if problem.surroundings is None else {
             c.name: c for c in problem.surroundings.fixed_at(q).constraints
         }  # fmt: skip
         rest = [
             still[c.name] if isinstance(c, Clearance) else c
             for k, c in enumerate(problem.constraints)
-            if not (first <= k < first + count or c.at_impact)
+            if not (first <= k < end or c.at_impact)
         ]
-        contact_at = self._point, oracle.numeric.placement(self._point).translation
-        above = PositionAlong("contact above the surface", *contact_at, self.normal[None], 0.0, np.inf)
-        line = PositionAlong("contact on the normal", *contact_at, tangents, 0.0, 0.0)
         dropped = (*_POSES, *_AT_REST) if first else (*_POSES, *_AT_REST, HeldTurn)
         struck = [c for k, c in enumerate(rest) if k < first or not isinstance(c, dropped)]
-        pressed = PositionAlong(above.name, *contact_at, self.normal[None], -_PRESSED, np.inf)
+        held = [c for c in rest if not (falls_freely(problem) and isinstance(c, _POSES))]
+        held += [] if turns else turned
+        above, line, pressed = list[Constraint](), list[Constraint](), list[Constraint]()
+        for oracle, n in zip(oracles, self.normals, strict=True):
+            at = oracle.point, oracle.numeric.placement(oracle.point).translation
+            above.append(PositionAlong("contact above the surface", *at, n[None], 0.0, np.inf))
+            line.append(PositionAlong("contact on the normal", *at, cone_axes(n)[:, 1:].T, 0.0, 0.0))
+            pressed.append(PositionAlong(above[-1].name, *at, n[None], -_PRESSED, np.inf))
         # The stop may use the margin of the joint limits.
-        margin = np.where(problem.lower < problem.upper, problem.requirements.limit_margin, 0.0)
+        margin = np.where(problem.lower < problem.upper, wanted.limit_margin, 0.0)
         wide = replace(problem, lower=problem.lower - margin, upper=problem.upper + margin)
         self.approach, self.run_up, self.rebound = (
             PathSpace(replace(limited, constraints=tuple(constraints), rows=()))
             for limited, constraints in (
-                (problem, [*rest, *turned, above]),
-                (problem, [*rest, *turned, above, line]),
-                (wide, [*struck, pressed]),
+                (problem, [*held, *above]),
+                (problem, [*held, *above, *line]),
+                (wide, [*struck, *pressed]),
             )
         )
 
+    def along(self, model: Numeric) -> Array:
+        """Return the rows ``n_iᵀJ_i``, shape (m, nv)."""
+        return np.array([n @ model.jacobian(at)[:3] for n, at in zip(self.normals, self._points, strict=True)])
+
     def rows(self, space: PathSpace) -> Callable[[Numeric], Array]:
-        """Return a function for the matrix ``(J_equalities; nᵀJ)`` of a space, shape (m, nv)."""
-        return lambda model: np.vstack(
-            [equality_jacobian(space.problem, model), self.normal @ model.jacobian(self._point)[:3]]
-        )
+        """Return a function for the matrix ``(J_equalities; n_iᵀJ_i)`` of a space, shape (rows + m, nv)."""
+        return lambda model: np.vstack([equality_jacobian(space.problem, model), self.along(model)])
 
     def begin(self, start: Array) -> Array | None:
         """Return a posture of ``approach`` near a posture ``start``, shape (nq,); ``None`` if none was reached.
 
-        The surface can be nearer than the contact point at the start, which then has to leave it.
+        The surface can be nearer than a contact point at the start, which then has to leave it.
         """
         if self.approach.valid(start):
             return start
-        J = self.approach.projector.numeric.at(start).jacobian(self._point)[:3]
-        steps = (height * np.linalg.pinv(J) @ self.normal for height in _HEIGHTS)
+        model = self.approach.projector.numeric.at(start)
+        J = np.vstack([model.jacobian(point)[:3] for point in self._points])
+        steps = (height * np.linalg.pinv(J) @ self.normals.ravel() for height in _HEIGHTS)
         pulled = (self.approach.pulled(start, step) for step in steps)
         moved = next((q for q in pulled if q is not None), None)
         return self.approach.apart(start) if moved is None else moved

@@ -38,8 +38,8 @@ class TimedCurve:
 
     Attributes:
         rows: Rows on the curve, and the motion between them.
-        method: ``time-optimal`` (fixed base), ``scaled`` (one time scale for the whole motion) or ``slowed`` (slower
-            at corners of the curve).
+        method: ``time-optimal`` (fixed base), ``scaled`` (one time scale for the whole motion), ``slowed`` (slower
+            at corners of the curve) or ``free fall``.
         notes: Limits that the motion does not respect, and why.
     """
 

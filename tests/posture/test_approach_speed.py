@@ -79,20 +79,20 @@ def fastest(posed: Prepared, q: Vector) -> float:
     pin.updateFramePlacements(model, data)
     nv, rows, arrives = model.nv, [], []
     contacts = posed.problem.objective.contacts
-    for contact in contacts:
+    for contact, pose in zip(contacts, (wanted.contact_pose, *wanted.other_poses), strict=True):
         frame = model.getFrameId(contact.frame)
         J = pin.getFrameJacobian(model, data, frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
         R = data.oMf[frame].rotation
         arm, n = R @ contact.offset, np.array(contact.normal)
         n = R @ n if contact.normal_frame == "contact" else n
         point = J[:3] - pin.skew(arm) @ J[3:]
-        if len(contacts) > 1:
+        if len(contacts) > 1 and not wanted.strike:
             rows, arrives = [*rows, n @ point], [*arrives, 1.0]
             continue
         rows, arrives = [*rows, *point], [*arrives, *n]
-        if wanted.contact_pose == "full":
+        if pose == "full":
             rows, arrives = [*rows, *J[3:]], [*arrives, 0.0, 0.0, 0.0]
-        elif wanted.contact_pose.startswith("aligned"):
+        elif pose.startswith("aligned"):
             # Only two of the three rows are independent, because the rotation about the normal is not constrained.
             rows, arrives = [*rows, *((np.eye(3) - np.outer(n, n)) @ J[3:])], [*arrives, 0.0, 0.0, 0.0]
     for frame in wanted.keep:

@@ -103,9 +103,9 @@ class AttainableSpeed:
 
     The contact point moves only along the normal, and the frames in :attr:`Requirements.keep` do not move.  The
     contact frame turns only if :attr:`Requirements.contact_pose` allows this, or if there are too few joints to
-    prevent a turn.  Several contacts all approach at the speed ``σ`` and may also move tangentially.  The base and
-    feet of a standing robot do not move.  The base of a robot without feet can move at any speed.  A contact whose
-    ``contact_pose`` is ``free`` is left out, because there an object hits the robot.
+    prevent a turn.  Several contacts all approach at the speed ``σ``, and may also move tangentially, except in a
+    strike.  The base and feet of a standing robot do not move.  The base of a robot without feet can move at any
+    speed.  A contact whose ``contact_pose`` is ``free`` is left out, because there an object hits the robot.
 
     For a strike (:attr:`Requirements.strike`), the joints also need room for a run-up: ``q_i − ν_i t`` is within the
     joint limits.  The time ``t`` is slightly longer than half of the shortest run-up.  A strike may use only the
@@ -249,7 +249,7 @@ def _moving_points(robot: Robot, objective: Objective, requirements: Requirement
         n = np.array(contact.normal)
         axes = np.vstack([n, np.linalg.svd(n[None, :])[2][1:]])
         point = point_on(robot, contact.frame, contact.offset)
-        rows = (0, 1, 2, *turning) if alone else (0,)
+        rows = (0, 1, 2, *turning) if alone or requirements.strike else (0,)
         points.append(MovingPoint(contact.frame, point, axes, rows, True, contact.normal_frame == "contact"))
     struck = {contact.frame for contact in objective.contacts}
     for frame in dict.fromkeys(requirements.keep):

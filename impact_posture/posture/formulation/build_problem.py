@@ -52,7 +52,7 @@ def build_problem(robot: Robot, objective: Objective, given: Array, requirements
     _check(robot, requirements)
     requirements = replace(requirements, hold=robot.fixed_with(requirements.hold))
     numeric = Numeric(robot.model).at(given)
-    constraints: list[Constraint] = [_held_support(robot, numeric, support) for support in objective.supports]
+    constraints: list[Constraint] = [held_support(robot, numeric, support) for support in objective.supports]
     held = {s.frame for s in objective.supports}
     poses = (requirements.contact_pose, *requirements.other_poses)
     # If a frame is struck along several normals, its pose is constrained only once.
@@ -173,7 +173,8 @@ def _check_target(requirements: Requirements) -> None:
         raise InputError(fault, where="target_quaternion" if quaternion is not None else "target_position", hint=hint)
 
 
-def _held_support(robot: Robot, numeric: Numeric, support: Support) -> Constraint:
+def held_support(robot: Robot, numeric: Numeric, support: Support) -> Constraint:
+    """Return the constraint that a foot stays where it is at ``numeric.q``."""
     point = point_on(robot, support.frame, support.offset)
     placement = numeric.placement(point)
     if support.kind == "point":
