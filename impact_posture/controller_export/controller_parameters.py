@@ -10,14 +10,40 @@ from numpy.typing import ArrayLike
 
 from impact_posture.controller_export.controller_structure import Structure
 from impact_posture.system.arrays import Array
+from impact_posture.tsid.flow.reference_flow_posture import ReferenceFlowPosture
 from impact_posture.tsid.joint_ranges import JointRanges
 from impact_posture.tsid.limits.acceleration_bounds import LimitLaw
 from impact_posture.tsid.tasks.frame_tasks import FrameTask
+from impact_posture.tsid.tasks.impact_robust import ImpactRobustPosture
 
 Rule = Literal["finite", "nonnegative", "positive", "limit", "amount", "share"]
 # Bit mask of each rule in the C code.  A value must be finite (bit 1), not negative (2), not zero (4), at most one
 # (8).
 RULES: dict[Rule, int] = {"finite": 1, "nonnegative": 3, "positive": 6, "limit": 0, "amount": 7, "share": 14}
+
+# Option of a reference flow or attribute of a contact, rule, and text.
+_FLOW: tuple[tuple[str, Rule, str], ...] = (
+    ("speed", "amount", "largest speed of an entry of q_r, rad/s or m/s"),
+    ("acceleration", "amount", "largest acceleration, rad/s2 or m/s2"),
+    ("rho", "nonnegative", "weight of the squared distance from the start, 1/rad2"),
+    ("mu", "amount", "smaller curvatures are raised to this value, 1/rad2"),
+    ("epsilon", "amount", "predicted decrease of H/H0 below which the flow rests"),
+    ("duration", "amount", "longest time of motion after a brace, not counting a path or rest, s"),
+    ("joint_margin", "nonnegative", "distance from the joint limits, rad or m"),
+    ("com_margin", "nonnegative", "distance of the center of mass from the edges of the support polygon, m"),
+    ("tilt", "amount", "largest tilt of the base from the default posture, rad"),
+    ("share", "share", "share of the actuators' limits that static controls may use"),
+    ("haste", "share", "fraction of the remaining control range for accelerations; (1 + haste)/2 to brake"),
+    ("tracking", "amount", "joint error at which the motion stops and waits, rad or m"),
+)
+_CONTACT: tuple[tuple[str, Rule, str], ...] = (
+    ("kp", "nonnegative", "stiffness, 1/s2"),
+    ("kd", "nonnegative", "damping, 1/s"),
+    ("friction", "positive", "Coulomb coefficient"),
+    ("least", "finite", "least normal force, N"),
+    ("normal", "finite", "unit normal out of the ground, world"),
+    ("half", "nonnegative", "half extents x, y of a sole, m"),
+)
 
 
 class Field(NamedTuple):
@@ -47,86 +73,73 @@ def parameters(s: Structure, period: float) -> Iterator[Field]:
     law = formulation.law or LimitLaw()
     nv = s.robot.nv
 
-    def field(name: str, rule: Rule, text: str, value: ArrayLike) -> Field:
-        values = np.array(value, dtype=float).ravel()
-        # C arrays cannot have the length zero.
-        return Field(name, rule, text, values if values.size else np.ones(1))
-
     gains = (("kp", "stiffness, 1/s2"), ("kd", "damping, 1/s"), ("weight", "weight in the cost"))
-    yield field("period", "positive", "expected time between ticks, s", period)
+    yield _field("period", "positive", "expected time between ticks, s", period)
     for name, text in gains:
         rows = np.hstack([np.zeros(0), *(getattr(task, name) for task in s.tasks)])
-        yield field(f"task_{name}", "nonnegative", f"{text}, of each row of the tasks", rows)
+        yield _field(f"task_{name}", "nonnegative", f"{text}, of each row of the tasks", rows)
     soft = [t._soften if isinstance(t, FrameTask) and t._soften is not None else np.zeros(6) for t in s.tasks]
-    yield field("task_softness", "nonnegative", "inverse apparent inertia of each task, 1/kg and 1/(kg m2)", soft)
+    yield _field("task_softness", "nonnegative", "inverse apparent inertia of each task, 1/kg and 1/(kg m2)", soft)
     for name, text in gains:
         value = np.zeros(nv) if posture is None else getattr(posture, name)
-        yield field(f"posture_{name}", "nonnegative", f"{text}, of the posture task", value)
+        yield _field(f"posture_{name}", "nonnegative", f"{text}, of the posture task", value)
     if posture is not None and posture.stiffness is not None and posture.damping is not None:
-        yield field("stiffness", "finite", "K_p of the posture task as a matrix, 1/s2", posture.stiffness)
-        yield field("damping", "finite", "K_d of the posture task as a matrix, 1/s", posture.damping)
+        yield _field("stiffness", "finite", "K_p of the posture task as a matrix, 1/s2", posture.stiffness)
+        yield _field("damping", "finite", "K_d of the posture task as a matrix, 1/s", posture.damping)
     target = None if posture is None else posture._given
     text = "1: reset sets q_des to posture_target; 0: to the present posture"
-    yield field("posture_given", "nonnegative", text, target is not None)
-    yield field("posture_target", "finite", "q_des at reset", s.robot.posture() if target is None else target)
-    for name, rule, text in (
-        ("kp", "nonnegative", "stiffness, 1/s2"),
-        ("kd", "nonnegative", "damping, 1/s"),
-        ("friction", "positive", "Coulomb coefficient"),
-        ("least", "finite", "least normal force, N"),
-        ("normal", "finite", "unit normal out of the ground, world"),
-        ("half", "nonnegative", "half extents x, y of a sole, m"),
-    ):
-        yield field(f"contact_{name}", rule, f"{text}, of each contact", [getattr(c, name) for c in contacts])  # type: ignore[arg-type]
+    yield _field("posture_given", "nonnegative", text, target is not None)
+    yield _field("posture_target", "finite", "q_des at reset", s.robot.posture() if target is None else target)
+    for name, rule, text in _CONTACT:
+        yield _field(f"contact_{name}", rule, f"{text}, of each contact", [getattr(c, name) for c in contacts])
     weights = [1.0 if c.weight is None else c.weight for c in contacts]
-    yield field("contact_weight", "positive", "weight in the cost of each contact that is not hard", weights)
-    yield field("force_weight", "positive", "weight of contact forces, 1/N2", formulation.force_weight)
+    yield _field("contact_weight", "positive", "weight in the cost of each contact that is not hard", weights)
+    yield _field("force_weight", "positive", "weight of contact forces, 1/N2", formulation.force_weight)
     spare = formulation.spare_weight
-    yield field("spare_weight", "positive", "weight of thrusts that produce no wrench, 1/N2", spare)
+    yield _field("spare_weight", "positive", "weight of thrusts that produce no wrench, 1/N2", spare)
     for name in ("lower", "upper"):
-        yield field(f"control_{name}", "limit", "limits of thrusts, N, and torques, N m", getattr(actuators, name))
+        yield _field(f"control_{name}", "limit", "limits of thrusts, N, and torques, N m", getattr(actuators, name))
     for name in ("lower", "upper"):
-        yield field(f"joint_{name}", "limit", "position limit of each entry of v, rad or m", getattr(ranges, name))
-    yield field("joint_velocity", "positive", "largest rate of each entry of v; may be infinite", ranges.velocity)
+        yield _field(f"joint_{name}", "limit", "position limit of each entry of v, rad or m", getattr(ranges, name))
+    yield _field("joint_velocity", "positive", "largest rate of each entry of v; may be infinite", ranges.velocity)
     propulsion = s.robot.spec.propulsion
     thrust = 1.0 if propulsion is None else propulsion.thrust_coefficient
-    yield field("thrust_coefficient", "positive", "thrust per squared rotor speed", thrust)
+    yield _field("thrust_coefficient", "positive", "thrust per squared rotor speed", thrust)
     for name in ("approach", "rate", "deceleration", "acceleration"):
-        yield field(f"law_{name}", "positive", f"{name} of the law of the joint limits", getattr(law, name))
-    yield field("law_margin", "nonnegative", "distance from the position limits at which joints stop", law.margin)
+        yield _field(f"law_{name}", "positive", f"{name} of the law of the joint limits", getattr(law, name))
+    yield _field("law_margin", "nonnegative", "distance from the position limits at which joints stop", law.margin)
     if s.flow is not None:
-        for name, rule, text in (
-            ("speed", "amount", "largest speed of an entry of q_r, rad/s or m/s"),
-            ("acceleration", "amount", "largest acceleration, rad/s2 or m/s2"),
-            ("rho", "nonnegative", "weight of the squared distance from the start, 1/rad2"),
-            ("mu", "amount", "smaller curvatures are raised to this value, 1/rad2"),
-            ("epsilon", "amount", "predicted decrease of H/H0 below which the flow rests"),
-            ("duration", "amount", "longest time of motion after a brace, not counting a path or rest, s"),
-            ("joint_margin", "nonnegative", "distance from the joint limits, rad or m"),
-            ("com_margin", "nonnegative", "distance of the center of mass from the edges of the support polygon, m"),
-            ("tilt", "amount", "largest tilt of the base from the default posture, rad"),
-            ("share", "share", "share of the actuators' limits that static controls may use"),
-            ("haste", "share", "fraction of the remaining control range for accelerations; (1 + haste)/2 to brake"),
-            ("tracking", "amount", "joint error at which the motion stops and waits, rad or m"),
-        ):
-            yield field(f"flow_{name}", rule, f"{text}, of the flow", getattr(s.flow.options, name))  # type: ignore[arg-type]
-        if s.flow._path:
-            yield field("flow_path", "finite", "postures that the flow visits first", s.flow._path)
+        yield from _flow_fields(s.flow)
     if robust is not None:
-        springs = ("keep", "release", "follow")
-        yield field("robust_gain", "nonnegative", "K, 1/s2", robust.K)
-        scale = 0 if robust._measure else robust.scale
-        yield field("robust_scale", "nonnegative", "lambda; 0: measured at reset", scale)
-        yield field("robust_reach", "positive", "largest length of the term, divided by K, rad", robust.reach)
-        yield field(
-            "robust_near", "nonnegative", "distance of each joint from a limit where the term vanishes", robust._near
-        )
-        yield field("robust_band", "positive", "width of the fade of each joint; may be infinite", robust._band)
-        yield field(
-            "robust_far", "positive", "distance from a limit at which a fade can begin, rad", robust._farthest
-        )
-        yield field("robust_every", "positive", "number of ticks per evaluation of the gradient", robust.every)
-        yield field("robust_ramp", "positive", "time from level 0 to 1, s", robust.activation.ramp)
-        yield field("robust_live", "nonnegative", "1: the term stays on during the contact", robust.activation.live)
-        yield field("robust_follow", "positive", "time constant of q_des if robust_spring is 2, s", robust._follow)
-        yield field("robust_spring", "nonnegative", "mode: 0 keep, 1 release, 2 follow", springs.index(robust.spring))
+        yield from _robust_fields(robust)
+
+
+def _flow_fields(flow: ReferenceFlowPosture) -> Iterator[Field]:
+    for name, rule, text in _FLOW:
+        yield _field(f"flow_{name}", rule, f"{text}, of the flow", getattr(flow.options, name))
+    if flow._path:
+        yield _field("flow_path", "finite", "postures that the flow visits first", flow._path)
+
+
+def _robust_fields(robust: ImpactRobustPosture) -> Iterator[Field]:
+    scale, spring = 0 if robust._measure else robust.scale, ("keep", "release", "follow").index(robust.spring)
+    ramp, live = robust.activation.ramp, robust.activation.live
+    yield _field("robust_gain", "nonnegative", "K, 1/s2", robust.K)
+    yield _field("robust_scale", "nonnegative", "lambda; 0: measured at reset", scale)
+    yield _field("robust_reach", "positive", "largest length of the term, divided by K, rad", robust.reach)
+    vanishes = "distance of each joint from a limit where the term vanishes"
+    yield _field("robust_near", "nonnegative", vanishes, robust._near)
+    yield _field("robust_band", "positive", "width of the fade of each joint; may be infinite", robust._band)
+    begins = "distance from a limit at which a fade can begin, rad"
+    yield _field("robust_far", "positive", begins, robust._farthest)
+    yield _field("robust_every", "positive", "number of ticks per evaluation of the gradient", robust.every)
+    yield _field("robust_ramp", "positive", "time from level 0 to 1, s", ramp)
+    yield _field("robust_live", "nonnegative", "1: the term stays on during the contact", live)
+    yield _field("robust_follow", "positive", "time constant of q_des if robust_spring is 2, s", robust._follow)
+    yield _field("robust_spring", "nonnegative", "mode: 0 keep, 1 release, 2 follow", spring)
+
+
+def _field(name: str, rule: Rule, text: str, value: ArrayLike) -> Field:
+    values = np.array(value, dtype=float).ravel()
+    # C arrays cannot have the length zero.
+    return Field(name, rule, text, values if values.size else np.ones(1))

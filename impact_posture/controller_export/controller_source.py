@@ -21,6 +21,7 @@ from impact_posture.codegen.sum_order import reorder_sums
 from impact_posture.config.problem_settings import Vector3
 from impact_posture.controller_export.controller_parameters import RULES, Field
 from impact_posture.controller_export.controller_structure import Structure
+from impact_posture.controller_export.daqp_sources import VERSION
 from impact_posture.controller_export.moving_tree import MovingTree
 from impact_posture.dynamics.model_parameters import ModelParameters
 from impact_posture.impact.impact_contact import point_on
@@ -222,6 +223,15 @@ def render(
         text = re.sub(r"\b(daqp\.h|relaxation\.h)", rf"{prefix}_\1", text)
         texts[f"{prefix}_{name}"] = named(text, prefix)
     return texts
+
+
+def build_files(prefix: str, sources: Sequence[str]) -> dict[str, str]:
+    """Return the Makefile and the CMake file of a controller; ``sources`` are its sources besides ``<prefix>.c``."""
+    templates = environment("impact_posture.controller_export", c_comment)
+    return {
+        name: templates.get_template(template).render(prefix=prefix, sources=sources, daqp=VERSION)
+        for name, template in (("Makefile", "controller.mk.jinja"), ("CMakeLists.txt", "controller.cmake.jinja"))
+    }
 
 
 def _files(sizes: dict[str, int]) -> list[str]:

@@ -98,12 +98,11 @@ def structure_of(robot: Robot, formulation: TaskFormulation) -> Structure:
     dense = (bool(formulation.weighted) or not assembly.contacts.hard.all()) and not momentum
     forces, hard = assembly.contacts.size, int(assembly.contacts.hard.sum())
     joints = nv - actuators.base
-    slots, units = Chart(robot.model).slots, [part for _, part in unit_parts(robot.model)]
     sizes = {
         "NQ": robot.nq,
         "NV": nv,
         "BASE": actuators.base,
-        "JOINTS": len(slots),
+        "JOINTS": len(Chart(robot.model).slots),
         "ROTORS": rotors,
         "CONTROLS": actuators.controls,
         "SPARE": spare,
@@ -131,24 +130,8 @@ def structure_of(robot: Robot, formulation: TaskFormulation) -> Structure:
     bounds = joints if law is not None and dense else 0
     sizes |= {"BOUNDED": bounds, "EQUATIONS": always}
     sizes["GENERAL"] = always + actuators.controls + sizes["CONES"] + bounds
-    tables = {
-        "joint_family": [_FAMILIES[s.kind.family] for s in slots],
-        "joint_q": [s.q.start for s in slots],
-        "joint_v": [s.v.start for s in slots],
-        "limit_q": JointRanges(robot).index.tolist(),
-        "unit": [x for part in units for x in (part.start, part.stop - part.start)],
-        "task_kind": [_KINDS.index(type(t)) for t in tasks],
-        "task_point": [points.index(t.point) if isinstance(t, FrameTask) else -1 for t in tasks],
-        "task_row": np.cumsum([0, *(t.size for t in tasks)]).tolist(),
-        "task_impedance": [int(isinstance(t, FrameTask) and t._soften is not None) for t in tasks],
-        "contact_point": [points.index(c.point) for c in contacts],
-        "contact_row": np.cumsum([0, *(c.size for c in contacts)]).tolist(),
-        "force_contact": [k for k, c in enumerate(contacts) for _ in range(c.size)],
-        "contact_cone": np.cumsum([0, *(c.cone(np.eye(3)).shape[0] for c in contacts)]).tolist(),
-        "contact_hard": [int(c.weight is None) for c in contacts],
-        "level_rows": [rows.stop - rows.start for _, rows in assembly.levels],
-    }
-    sizes |= {"UNITS": len(units), "LEVELS": len(tables["level_rows"])}
+    tables = _tables(robot, tasks, formulation, assembly)
+    sizes |= {"UNITS": len(tables["unit"]) // 2, "LEVELS": len(tables["level_rows"])}
     _add_flow(robot, formulation, sizes, tables)
     doubles: dict[str, Any] = {
         "inverse": actuators.inverse,
@@ -166,6 +149,31 @@ def structure_of(robot: Robot, formulation: TaskFormulation) -> Structure:
     names = (*(bounded if sizes["SIMPLE"] else ()), *rows, *(bounded if bounds else ()))
     levels = tuple(name for name, _ in assembly.levels)
     return Structure(robot, formulation, actuators, tasks, points, sizes, arrays, levels, names)
+
+
+def _tables(
+    robot: Robot, tasks: tuple[Task, ...], formulation: TaskFormulation, assembly: Assembly
+) -> dict[str, list[int]]:
+    """Return the constant arrays of integers: joints, unit parts of ``q``, tasks, contacts and strict levels."""
+    slots, units = Chart(robot.model).slots, [part for _, part in unit_parts(robot.model)]
+    contacts, points = formulation.contacts, formulation.points
+    return {
+        "joint_family": [_FAMILIES[s.kind.family] for s in slots],
+        "joint_q": [s.q.start for s in slots],
+        "joint_v": [s.v.start for s in slots],
+        "limit_q": JointRanges(robot).index.tolist(),
+        "unit": [x for part in units for x in (part.start, part.stop - part.start)],
+        "task_kind": [_KINDS.index(type(t)) for t in tasks],
+        "task_point": [points.index(t.point) if isinstance(t, FrameTask) else -1 for t in tasks],
+        "task_row": np.cumsum([0, *(t.size for t in tasks)]).tolist(),
+        "task_impedance": [int(isinstance(t, FrameTask) and t._soften is not None) for t in tasks],
+        "contact_point": [points.index(c.point) for c in contacts],
+        "contact_row": np.cumsum([0, *(c.size for c in contacts)]).tolist(),
+        "force_contact": [k for k, c in enumerate(contacts) for _ in range(c.size)],
+        "contact_cone": np.cumsum([0, *(c.cone(np.eye(3)).shape[0] for c in contacts)]).tolist(),
+        "contact_hard": [int(c.weight is None) for c in contacts],
+        "level_rows": [rows.stop - rows.start for _, rows in assembly.levels],
+    }
 
 
 def _add_flow(

@@ -20,7 +20,7 @@ from impact_posture.config.checked import checked
 from impact_posture.controller_export.compiled_controller import CompiledController
 from impact_posture.controller_export.controller_manifest import SCHEMA, build_controller
 from impact_posture.controller_export.controller_parameters import Field, parameters
-from impact_posture.controller_export.controller_source import render
+from impact_posture.controller_export.controller_source import build_files, render
 from impact_posture.controller_export.controller_structure import Structure, structure_of
 from impact_posture.controller_export.daqp_sources import FILES, VERSION, daqp_sources, renamed
 from impact_posture.controller_export.path_source import path_reference, render_path
@@ -134,7 +134,7 @@ def export_controller(
     texts |= renamed(sources, prefix) | along
     texts[f"{prefix}.json"] = json.dumps(manifest, indent=2, allow_nan=False) + "\n"
     texts |= {} if objective is None or metric is None or shared else _metric(objective, metric)
-    texts["Makefile"], texts["CMakeLists.txt"] = _makefile(manifest), _cmake(manifest)
+    texts |= build_files(prefix, manifest["sources"])
     out = Path(out or f"{prefix}-c")
     library = library_path(out, prefix)
     products = (library.name, f"{library.name}.sha256")
@@ -185,53 +185,3 @@ def _manifest(s: Structure, fields: Sequence[Field], prefix: str) -> dict[str, A
         "bounds": list(s.bounds),
         "versions": {"impact_posture": __version__, "casadi": str(ca.CasadiMeta.version()), "daqp": VERSION},
     }
-
-
-def _makefile(manifest: dict[str, Any]) -> str:
-    prefix = manifest["prefix"]
-    return f"""# make: a library to link or to load at run time.
-CC ?= cc
-CFLAGS ?= -O2
-# Strict C forbids fused multiply-adds by default.  For this very machine: CFLAGS="-O3 -march=native".
-ALL_CFLAGS = -std=c99 -ffp-contract=fast -fPIC -isystem daqp $(CFLAGS)
-
-lib{prefix}.so: {prefix}.c {prefix}.h
-\trm -f $@.sha256
-\t$(CC) $(ALL_CFLAGS) -shared {prefix}.c {" ".join(manifest["sources"])} -o $@ -lm
-
-clean:
-\trm -f lib{prefix}.so lib{prefix}.so.sha256
-
-.PHONY: clean
-"""
-
-
-def _cmake(manifest: dict[str, Any]) -> str:
-    prefix = manifest["prefix"]
-    here = [name for name in manifest["sources"] if name != f"{prefix}_daqp.c"]
-    return f"""# add_subdirectory(<this folder>), then target_link_libraries(<program> PRIVATE {prefix}::{prefix})
-cmake_minimum_required(VERSION 3.16)
-project({prefix} LANGUAGES C)
-
-if(NOT CMAKE_BUILD_TYPE AND NOT CMAKE_CONFIGURATION_TYPES)
-  set(CMAKE_BUILD_TYPE Release)
-endif()
-
-# CMake reserves names like test, all and install, so the target and its file have different names.
-add_library({prefix}_library {" ".join([f"{prefix}.c", *here])})
-add_library({prefix}::{prefix} ALIAS {prefix}_library)
-set({prefix}_DAQP "" CACHE STRING "installed library of DAQP {VERSION}; empty: the sources here")
-if({prefix}_DAQP)
-  target_link_libraries({prefix}_library PUBLIC ${{{prefix}_DAQP}})
-  target_compile_definitions({prefix}_library PRIVATE {prefix.upper()}_INSTALLED_DAQP)
-else()
-  target_sources({prefix}_library PRIVATE {prefix}_daqp.c)
-endif()
-target_include_directories({prefix}_library PUBLIC "${{CMAKE_CURRENT_SOURCE_DIR}}")
-target_include_directories({prefix}_library SYSTEM PRIVATE "${{CMAKE_CURRENT_SOURCE_DIR}}/daqp")
-set_target_properties({prefix}_library PROPERTIES OUTPUT_NAME {prefix}
-  C_STANDARD 99 C_STANDARD_REQUIRED ON POSITION_INDEPENDENT_CODE ON)
-if(UNIX)
-  target_link_libraries({prefix}_library PUBLIC m)
-endif()
-"""
