@@ -69,7 +69,7 @@ def oracle_along(objective: WorstCaseObjective, normal: Array) -> ImpactOracle:
     return ImpactOracle(replace(objective.case, contact=replace(objective.contact, normal=(x, y, z))))
 
 
-# Unit vector that is not parallel to an axis, because many entries of the gradient would otherwise be zero.
+# Unit normal of the self-test.  With a normal parallel to an axis, many entries of the gradient would be zero.
 _NORMAL = (0.48, -0.6, 0.64)
 _SCALARS = frozenset({"H", "objective", "G", "V"})
 

@@ -50,7 +50,7 @@ class FittedShapes:
 
 @dataclass(frozen=True, eq=False)
 class RobotShapes(FittedShapes):
-    """Collision shapes with their robot, which loads the shapes of the URDF on demand.
+    """Collision shapes and their robot; the shapes of the URDF are loaded on demand.
 
     ``without_shapes`` names the links for which the URDF describes only unusable shapes.  It also names the first
     link of each joint that moves a mass but no shape.

@@ -89,7 +89,7 @@ class Report:
             important levels determine the same motion, or rows contradict each other, or the posture is nearly
             singular.
         residuals: Task name → ``ÿ − ÿ*``; the name ``contacts`` stands for all contacts.
-        active: Pairs of the name of an active bound and ``lower`` or ``upper``.
+        active: Name of each active bound, with its side ``lower`` or ``upper``.
         dynamics: Error of the equations of motion, ``‖Mν̇ + h − Gu − Jᵀf − J_eᵀF̂‖_∞``.
         level: Activation of a posture task that prepares for impacts, 0 to 1.
         objective: Value of the posture task's objective, for example ``H``; NaN without such a task.

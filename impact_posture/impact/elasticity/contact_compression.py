@@ -185,7 +185,7 @@ class Compression:
             if not self.by_material:
                 return ""
             each = ", ".join(f"{float(f'{x:.2g}'):g} on {name}" for name, x in self.by_material.items())
-            ranges = f"up to {SHORT:g} only the links respond, from {LONG:g} links and rotors"
+            ranges = f"up to {SHORT:g}, only the links respond; from {LONG:g}, links and rotors respond"
             return f"x = {each} ({ranges}); {_TIP_ONLY}: state `contact_duration`"
         if self.fitting == "link":
             meaning = "the contact is over before the rotors move: joint model 'link'"

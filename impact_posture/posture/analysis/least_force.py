@@ -37,7 +37,7 @@ def least_effective_mass(
 def explain_force_bound(
     error: Infeasible, prepared: Prepared, *, starts: int, seed: int, jobs: int, compile: CompileMode
 ) -> None:
-    """Add the least peak force that the other constraints allow to the error of an infeasible problem.
+    """Reword the error of an infeasible problem: state the least peak force that the other constraints allow.
 
     Leave the error as it is if the problem has no bound on the force, has model variants, or is infeasible without
     this bound.

@@ -81,10 +81,10 @@ def fix_undetermined_motions(
         held = HeldTurn(base, placement.rotation, axis, f"base {name}")
         if np.abs(held.evaluate(numeric)[1] @ move @ free()).max(initial=0.0) > 1e-3:
             added.append(held)
-            notes.append(f"base {name} fixed at its initial value: nothing else determines it")
+            notes.append(f"base {name} is fixed at its initial value, because nothing else determines it")
     if np.abs(free()[:3]).max(initial=0.0) > 1e-3:
         added.append(HeldPosition("base position", base, placement.translation))
-        notes.append("base position fixed at its initial value: nothing else determines it")
+        notes.append("base position is fixed at its initial value, because nothing else determines it")
     return added, notes
 
 
@@ -110,7 +110,7 @@ def make_well_posed(problem: ConstrainedProblem) -> ConstrainedProblem:
             turn = HeldTurn(base_point(), rotation, axis, f"base {name}")
             if _only_to_first_order(problem, numeric, turn, postures[0]):
                 added.append(turn)
-                notes.append(f"{turn.name} held: the feet block it, although their linearization allows it")
+                notes.append(f"{turn.name} is held: the feet block it, although their linearization allows it")
     problem = replace(problem, constraints=(*problem.constraints, *added), notes=(*problem.notes, *notes))
     # A posture may happen to be singular, for example with a straight arm, so use the posture with the highest rank.
     generic = max(postures, key=lambda q: rank(equality_jacobian(problem, numeric.at(q)), _BLURRED))

@@ -186,7 +186,7 @@ class GrowingSearch:
 
     def _grow(self, owed: list[tuple[SolveRecord, ConstrainedProblem]]) -> None:
         """Add the rows that the program lacks at the results ``owed``, each given with the problem of its run."""
-        # Auxiliaries can be used only with the program of their run.
+        # Auxiliary unknowns can be used only with the program of their run.
         now = [record for record, problem in owed if problem is self.problem]
         before = [record.q for record, problem in owed if problem is not self.problem]
         numeric = self.nlp.program.numeric

@@ -172,7 +172,7 @@ def solve(
     notes += notes_on_impacts(problem.objective, initial, q)
     if touching:
         count = len(certified) - len(good)
-        notes.append(f"{count} certified postures left out, because original shapes touch there: {touching}")
+        notes.append(f"{count} certified postures were left out, because original shapes touch there: {touching}")
     dominated = sum(r.dominated for r in runs)
     if screening is None:
         relative = np.array([o.objective for o in optima]) / max(abs(optima[0].objective), 1e-300)
