@@ -33,7 +33,6 @@ class Layout:
     """Blocks of a graph, and array indices for the values that later blocks use.
 
     Attributes:
-        graph: The graph.
         blocks: The blocks in the order in which they are called.
         inlined: Nodes that are computed inside the statement of the only operation that uses them.
         slots: Node that a later block uses → index of the node's value in the work array.  Each width has a work

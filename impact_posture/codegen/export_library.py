@@ -22,7 +22,6 @@ class NamedObjective:
     """An objective to export, with its C names.
 
     Attributes:
-        objective: The objective.
         stem: Text with which the C names of the objective begin.
         free: Whether this objective ignores the supports of a standing robot.
         joint: Whether this objective is for several simultaneous contacts; ``H`` of such an objective is not

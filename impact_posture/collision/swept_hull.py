@@ -42,7 +42,6 @@ class SweptHull:
 
     Attributes:
         name: Unique name for messages, made of the name of the link and the number of the shape.
-        link: Name of the link.
         joint: Index of the joint in the model; 0 is the world.
         vertices: Corners of the hull in the axes of the joint, shape (k, 3) with k ≤ 40, m.
         radius: Sweep radius, m.

@@ -36,7 +36,6 @@ class Structure:
     """Formulation with the sizes and tables that its C code needs.
 
     Attributes:
-        robot: The robot.
         formulation: Tasks, contacts and limits.
         actuators: Rotors and motors.
         tasks: Tasks of the strict levels, then the weighted tasks.

@@ -28,7 +28,6 @@ class Output:
     """Output folder of an experiment, and options for the figures and the report in it.
 
     Attributes:
-        folder: Path of the folder.
         force: If true, an earlier result in the folder may be replaced.
         formats: File formats of the figures.
         report: If true, ``report.html`` is written.

@@ -39,7 +39,6 @@ class JobStore:
     begins with its checksum and contains the checksums of its time series.  If a file is damaged, its job runs again.
 
     Attributes:
-        folder: Path of the folder.
         used: Whether :func:`run_batch` has returned stored documents.
     """
 

@@ -38,7 +38,6 @@ class Job:
 
     Attributes:
         scenario: Name or file of the scenario.
-        controller: Name of the controller.
         seed: Seed of the sensor noise and of the changes in ``[spread]`` of the scenario.
         mode: ``live``, or ``held`` to hold the reached posture (:func:`impact_posture.simulation.run.run`).
         free: If true, the impact model ignores the contacts at the feet.

@@ -140,7 +140,6 @@ class Reproduction:
     """Results of all controllers in all scenarios.
 
     Attributes:
-        seeds: Number of seeds.
         rows: One row per scenario and controller, sorted by scenario, with nominal as the first controller.
         jobs: Jobs of all rows.
     """

@@ -35,7 +35,6 @@ class Interval:
     Attributes:
         mean: Mean of the samples.
         half_width: Half width of the interval; ``None`` for one sample.
-        samples: Number of samples.
     """
 
     mean: float
@@ -78,10 +77,8 @@ class ControllerRow:
     """Results of a controller in a scenario, over all seeds.
 
     Attributes:
-        scenario: Name of the scenario.
         controller: Label of the controller.
         status: ``completed`` if all runs completed, otherwise the worst status of a run.
-        runs: Number of runs.
         completed: Number of runs that completed.
         failed: Seed and reason of each run that did not complete, one line per run.
         metrics: Name in :data:`QUANTITIES` → mean over the completed runs; empty if no run completed.  Quantities

@@ -42,7 +42,6 @@ class WorstCaseObjective:
     variants.  :mod:`impact_posture.impact.worst_case` has a class for each type of maximum.
 
     Attributes:
-        robot: The robot.
         contact: Point and normal of the first contact.
         metric: Weight matrix ``W`` in the squared norm of the velocity jump.
         kind: Objective type: ``impulse``, ``speed``, ``sticking``, ``coulomb``, ``energy`` or ``effective-mass``.

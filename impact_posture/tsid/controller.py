@@ -112,7 +112,6 @@ class Controller:
     """Task-space inverse dynamics by one QP per tick.
 
     Attributes:
-        robot: The robot.
         formulation: Tasks, contacts and limits.
         period: Expected time between ticks, s.
         state: Dynamics of the robot at the last tick.

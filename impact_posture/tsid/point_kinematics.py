@@ -25,7 +25,6 @@ class Point:
     """A point that is fixed in a frame of the robot.
 
     Attributes:
-        frame: Name of the frame.
         offset: Position of the point in the coordinates of the frame, m.
     """
 

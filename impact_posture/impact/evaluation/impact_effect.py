@@ -18,7 +18,6 @@ class WorstJoint(JsonBlock):
     """The joint with the largest ratio of velocity jump to velocity limit.
 
     Attributes:
-        name: Name of the joint.
         velocity: Size of the velocity jump of this joint, in ``unit``.
         unit: ``rad/s`` or ``m/s``.
         share: Velocity jump divided by the velocity limit of this joint; ``None`` if no joint has a limit.  Without

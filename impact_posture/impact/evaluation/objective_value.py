@@ -20,7 +20,6 @@ class VariantValue:
     """Quantities of the impact for one model variant.
 
     Attributes:
-        name: Name of the variant.
         objective: Objective for this variant; ``None`` if it does not exist at the posture.
         scalars: H, G, V, S, E of the first contact for this variant.
     """

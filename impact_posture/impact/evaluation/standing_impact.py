@@ -23,7 +23,6 @@ class StandingImpact(JsonBlock):
     """The predicted impact if the ground can only push the feet.
 
     Attributes:
-        jump: The velocity jump.
         lifts: Frames of the feet that lift or tip.
         slides: Frames of the feet that slide without lifting.
         time: Time over which the feet carry the weight in this prediction, s: the compression time of the contact, or

@@ -83,7 +83,6 @@ class Screening:
         values: For each distinct objective where descents ended, best first: the number of random postures that
             descended to it.  The last entries are 1, each for a random posture whose descent got stuck.
         partial: Whether the problem has constraints that descents ignore, such as clearances.
-        hops: Number of hops.
     """
 
     guesses: tuple[Array, ...]

@@ -34,7 +34,6 @@ class SingularTarget:
     """A constraint whose Jacobian has a lower rank at all given postures than at random postures.
 
     Attributes:
-        name: Name of the constraint.
         rank: Largest rank of the Jacobian of the constraint at the given postures.
         full_rank: Rank of this Jacobian at random postures.
         bent: Joint positions at which the rank is full, rad; empty if the target is stated by the user.
