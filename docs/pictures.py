@@ -33,7 +33,7 @@ BROWSER = ("chromium", "--headless=new", "--no-sandbox", "--use-angle=swiftshade
 def picture_report(page: Path) -> None:
     """Take a picture of a report at 60 % of the motion, if the browser is installed."""
     if shutil.which(BROWSER[0]) is None:
-        print(f"{BROWSER[0]} is not installed: the picture of the report stays")
+        print(f"{BROWSER[0]} is not installed: the picture of the report is not changed")
         return
     shot = page.with_suffix(".png")
     subprocess.run([*BROWSER, f"--screenshot={shot}", f"{page.as_uri()}#0.6"], check=True, stderr=subprocess.DEVNULL)

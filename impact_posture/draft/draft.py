@@ -66,7 +66,7 @@ def write_draft(robot: str, options: LoadOptions, out: Path | None, *, force: bo
         if force:
             os.replace(temporary, out)
         else:
-            os.link(temporary, out)  # Fails if another process has made the file in the meantime.
+            os.link(temporary, out)  # This call fails if another process has made the file in the meantime.
     except OSError as error:
         raise OutputError.unwritable(out, error, "name another file") from None
     finally:

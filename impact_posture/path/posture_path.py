@@ -31,7 +31,8 @@ _NOT_SMOOTH = "no smooth curve through the path satisfies the constraints"
 _EVERYWHERE = f"{USABLE:.0%} of the velocity limits, joint limits or other constraints in every posture of the search"
 # Largest number of optima to try, best first.
 _OPTIMA = 5
-# An optimum with a larger objective is struck instead if its speed exceeds the greatest speed so far by this factor.
+# The path strikes in an optimum with a larger objective if its speed exceeds the greatest speed so far by this
+# factor.
 _FASTER = 1.02
 # A path below this tangent length counts as no motion, rad mixed with m.
 _NO_MOTION = 1e-6
@@ -123,10 +124,10 @@ def posture_path(
     the constraints.
 
     If ``strike`` is given, the contact point arrives at the optimum with this speed, m/s
-    (:mod:`~impact_posture.path.strike`).  If no optimum can be struck at this speed, the path strikes the optimum
-    with the greatest speed.  If no optimum can be struck at all, the path ends at rest.  ``restitution`` is the
-    coefficient of the predicted impact, after which :mod:`~impact_posture.path.follow_through` stops the robot.  The
-    path of a robot that nothing holds up is its fall to the optimum.
+    (:mod:`~impact_posture.path.strike`).  If no optimum allows a strike at this speed, the path ends at the optimum
+    with the greatest speed.  If no optimum allows a strike at any speed, the path ends at rest.  ``restitution`` is
+    the coefficient of the predicted impact, after which :mod:`~impact_posture.path.follow_through` stops the robot.
+    The path of a robot that nothing holds up is its fall to the optimum.
 
     Raises:
         InputError: The package of the extra ``path`` is not installed, or the contact cannot strike.
@@ -211,10 +212,10 @@ def _struck(
         best, struck = (k, *led), led[0].strike
         if not struck.hindrance:
             break
-        slow = f"the optimum can be struck at {struck.speed:.3g} m/s at most, because of {struck.hindrance}"
+        slow = f"the optimum allows a strike at {struck.speed:.3g} m/s at most, because of {struck.hindrance}"
         failure = failure or slow
     if best is None:
-        return failure or "no optimum can be struck"
+        return failure or "no optimum allows a strike"
     k, run, method = best
     after = follow_through(solution.problem, run.motion.rows.q[-1], run.strike.velocity, restitution, limits)
     failure = f"{failure}; the path ends at optimum number {k + 1} of {len(solution.optima)}" if k else ""

@@ -179,7 +179,7 @@ def _keyframes(model: Any) -> dict[str, dict[str, Array]]:
 
 
 def _rerooted(spec: Any, free: list[Any], path: Path) -> Any:
-    """Compile a spec without its free joints, or with a free joint at its only body on the world."""
+    """Compile a spec without its free joints, or with a free joint at the only body that is on the world."""
     if free:
         for joint in free:
             spec.delete(joint)

@@ -32,7 +32,7 @@ class Setup:
         robot: Robot of the scenario.
         q: Start posture, shape (nq,).
         world: Simulated world before its first reset.
-        expected_gap: Distance between shape and surface at the start that controllers expect, m; ``None`` if they
+        expected_gap: Distance between shape and surface that controllers expect at the start, m; ``None`` if they
             know the true distance.
     """
 

@@ -128,7 +128,7 @@ def _speed(measured: Summary) -> float:
 
 
 def _lost(measured: Summary) -> float:
-    """Return the plastic loss of tip speed, m/s, of the effective mass of the links and the mass of the box."""
+    """Return the plastic loss of tip speed, m/s, from the effective mass of the links and the mass of the box."""
     j = Arm().approach(measured.q)
     mass = 1 / float(j @ np.linalg.solve(Arm().inertia(measured.q), j))
     box = MASSES[measured.group.box]
