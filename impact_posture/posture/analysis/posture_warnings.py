@@ -39,7 +39,7 @@ def posture_warnings(
 
 
 def _balance_warnings(prepared: Prepared, q: Array, posture: str) -> list[str]:
-    """Warn about a center of mass that is not above the feet, if no constraint keeps it there."""
+    """Warn about a center of mass that is not above the feet, which is possible without ``com_over_feet``."""
     robot, supports = prepared.impact.robot, prepared.impact.supports
     if not supports:
         return []
