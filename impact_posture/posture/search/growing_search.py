@@ -40,7 +40,7 @@ _LEAST = 2
 # A start is dominated, and stops, if its objective exceeds the best objective by this fraction.  The fraction is
 # large because the repetition of a trapped run (:attr:`SolverRun.trapped`) may end at a lower objective.
 _FAR = 0.05
-# Runs with fewer unknowns in total stay in this process, because starting other processes would take longer.
+# If the runs have fewer unknowns in total, they stay in this process, because starting processes would take longer.
 _FORK = 200
 # Starts that continue from postures this close (rad, m) share one run, because their runs would end at the same
 # posture.
