@@ -21,7 +21,7 @@ Rule = Literal["finite", "nonnegative", "positive", "limit", "amount", "share"]
 # (8).
 RULES: dict[Rule, int] = {"finite": 1, "nonnegative": 3, "positive": 6, "limit": 0, "amount": 7, "share": 14}
 
-# Option of a reference flow or attribute of a contact, rule, and text.
+# Name of an option of a reference flow or of an attribute of a contact, its rule, and its text.
 _FLOW: tuple[tuple[str, Rule, str], ...] = (
     ("speed", "amount", "largest speed of an entry of q_r, rad/s or m/s"),
     ("acceleration", "amount", "largest acceleration, rad/s2 or m/s2"),

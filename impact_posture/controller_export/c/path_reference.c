@@ -29,7 +29,7 @@ static void ip_exponential_rate(const double *z, const double *x, double *out)
   }
 }
 
-/* Write the reference at the time u (0 to 1) of h seconds, from the posture q with the coefficients c of u to u^5. */
+/* Write the reference at the time u (0 to 1) of h seconds, from the posture q with the coefficients c of the powers u to u^5. */
 static void ip_path_write(ip_path *p, const double *q, const double *c, double u, double h)
 {
   double z[IP_NV], dz[IP_NV], ddz[IP_NV];

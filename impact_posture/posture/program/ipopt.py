@@ -1,4 +1,4 @@
-"""Call IPOPT with suitable options and one thread for linear algebra, so that Ctrl-C stops the solver.
+"""Call IPOPT with suitable options and with one thread for linear algebra, and let Ctrl-C stop the solver.
 
 NumPy, SciPy and CasADi (for MUMPS in IPOPT) each bring a BLAS that uses all cores.  The systems here have about a
 hundred unknowns, so these threads only wait for each other and block the cores of parallel starts.

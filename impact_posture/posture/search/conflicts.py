@@ -157,7 +157,8 @@ class ElasticProgram:
         f = ca.dot(price, up + down) + _SLACK_PRICE * lifted.slack + self._away
         known = self._rows.derivatives(lifted)
         slacks = ca.horzcat(place, -place)
-        # The slacks stand between x and the auxiliaries in the vector of unknowns. The rows are linear in the slacks.
+        # The slacks stand between x and the auxiliary unknowns in the vector of unknowns. The rows are linear in the
+        # slacks.
         hessian, others = ca.SX(nx + 2 * k + z, nx + 2 * k + z), [*range(nx), *range(nx + 2 * k, nx + 2 * k + z)]
         hessian[others, others] = known.hessian
         jacobian = ca.horzcat(known.jacobian[:, :nx], slacks, known.jacobian[:, nx:])

@@ -1,4 +1,4 @@
-"""Global search: a complete map after the adaptive search if one or two degrees of freedom are left.
+"""Global search: the adaptive search, then a complete map if one or two degrees of freedom are left.
 
 The map (:mod:`impact_posture.posture.manifold.self_motion`) bounds how much lower than the best value the objective
 can be.  With more degrees of freedom, the adaptive search (:mod:`impact_posture.posture.search.screening`) already
