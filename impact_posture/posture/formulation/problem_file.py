@@ -138,8 +138,7 @@ def requirements(settings: ProblemSettings, objective: Objective) -> Requirement
 
 
 def _approaches(settings: ProblemSettings, objective: Objective) -> bool:
-    """Return the setting ``approach``; by default, true if a speed is stated or for a strike, unless the robot
-    flies."""
+    """Return the setting ``approach``; by default, true for a strike or a stated speed, unless the robot flies."""
     if settings.approach is not None:
         return settings.approach
     flies = objective.robot.floating and not objective.supports and settings.base != "fixed"
