@@ -110,8 +110,8 @@ def follow_through(
     Held joints and feet are assumed not to move.  The velocity after the impact may exceed the limits.
 
     A robot that falls (:func:`~impact_posture.path.strike_spaces.falls_freely`) then stands on its contacts, and
-    ``limits`` are the limits of the standing robot (:func:`~impact_posture.path.strike_spaces.landed`).  A leg whose
-    foot rebounds presses it onto the ground again.  So only plastic impacts are considered after a fall.
+    ``limits`` are the limits of the standing robot (:func:`~impact_posture.path.strike_spaces.landed`).  If a foot
+    rebounds, its leg presses the foot onto the ground again.  So only plastic impacts are considered after a fall.
     """
     falls = falls_freely(problem)
     standing, restitutions = (landed(problem, q), (0.0,)) if falls else (problem, RESTITUTIONS)
@@ -170,7 +170,7 @@ def _stop(
     """Return the shortest stop from a velocity, or why none exists.
 
     Per length of the curve, the normal velocities of the contact points are constant, so contact points rebound.  If
-    the robot falls, the velocity of its center of mass is constant instead, so the feet only have to push.
+    the robot falls, the velocity of its center of mass is constant instead, so the ground need not pull the feet.
     """
     space = spaces.rebound
     held = equality_jacobian(space.problem, Numeric(space.model).at(q))

@@ -127,7 +127,7 @@ def posture_path(
     (:mod:`~impact_posture.path.strike`).  If no optimum allows a strike at this speed, the path ends at the optimum
     with the greatest speed.  If no optimum allows a strike at any speed, the path ends at rest.  ``restitution`` is
     the coefficient of the predicted impact, after which :mod:`~impact_posture.path.follow_through` stops the robot.
-    The path of a robot that nothing holds up is its fall to the optimum.
+    If nothing supports the robot, its path is a fall to the optimum.
 
     Raises:
         InputError: The package of the extra ``path`` is not installed, or the contact cannot strike.

@@ -88,7 +88,7 @@ def check_strike(problem: ConstrainedProblem, speed: float) -> None:
     elif not speed > 0:
         fault, hint = "needs an approach speed above zero", "give `speed`"
     elif falls_freely(problem) and np.abs(normals + gravity / np.linalg.norm(gravity)).max() > _TILT:
-        fault, hint = "needs level ground, because nothing holds up the robot, so it falls", "give `support`"
+        fault, hint = "needs level ground, because nothing supports the robot, so it falls", "give `support`"
     if fault:
         raise InputError(fault, where="strike", hint=hint)
 
@@ -198,7 +198,7 @@ def run_up(problem: ConstrainedProblem, q: Array, speed: float, limits: Actuator
 
     The contact frames turn only if there are too few joints to prevent it.  The capture point of a robot that stands
     stays away from the edges of the feet, unless this bounds the speed.  If active bounds limit the speed, the robot
-    comes from the inside of these bounds.  A robot that nothing holds up falls (:func:`_fall`).
+    comes from the inside of these bounds.  A robot without support falls (:func:`_fall`).
     """
     if falls_freely(problem):
         return _fall(problem, q, speed)

@@ -83,7 +83,7 @@ def read_record(folder: Path) -> dict[str, Any] | None:
 def foreign_files(folder: Path, ours: frozenset[str] = frozenset(), below: str = "") -> list[str]:
     """Return the files and folders in a folder that neither ``ours`` nor a record in the folder lists, sorted.
 
-    ``below`` is the path of the folder in the names of ``ours`` and of the result.
+    Names in ``ours`` and in the result begin with ``below``, the path of the folder.
     """
     content = read_record(folder)
     names = [] if content is None else [RECORD, *content["files"], *content["products"]]

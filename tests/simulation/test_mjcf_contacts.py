@@ -224,7 +224,7 @@ def standing(folder: Path, text: str, shapes: str = "") -> Setup:
 
 
 def test_a_robot_lands_on_its_feet_as_in_its_file(tmp_path: Path) -> None:
-    """A quadruped falls 2 cm onto its feet, with the geoms of the MJCF, beside MuJoCo with the file itself."""
+    """A quadruped falls 2 cm onto its feet, with the geoms of the MJCF, as in MuJoCo with the file itself."""
     law = '<default><geom friction=".8" solref=".004 1" solimp=".95 .99 .001"/>'
     text = QUADRUPED.replace("<default>", law, 1)
     setup = standing(tmp_path, text)

@@ -125,7 +125,8 @@ def test_a_sliding_impact_jumps_as_predicted(friction: float) -> None:
     law = ContactLaw(solref=(2e-4, 1.0), solimp=(0.9999, 0.9999, 0.001), friction=friction)
     prediction, run, setup = drop(law, shared_factory("aerial-vertical").setup.q, timestep=2.5e-5)
     assert prediction.restitution is not None and prediction.coulomb is not None and prediction.sticking is not None
-    # The convex model of MuJoCo lifts a sliding contact, so the measured restitution is larger than the law has.
+    # The convex model of MuJoCo lifts a sliding contact, so the measured restitution is larger than the restitution
+    # of the law.
     more = (1 + restitution(setup, run, 0.5)) / (1 + prediction.restitution)
     assert prediction.measured == pytest.approx(more * prediction.coulomb, rel=0.05)
     assert prediction.ratio == pytest.approx(prediction.measured / prediction.coulomb)

@@ -32,7 +32,7 @@ class LinkGeom(NamedTuple):
 
 
 def solid_links(robot: Robot) -> Iterator[tuple[int, str, pin.Frame, list[int]]]:
-    """Yield number, name, frame and solid geoms of each body of the MJCF of a robot that has solid geoms.
+    """Yield the number, name, frame and solid geoms of each body with solid geoms in the MJCF of a robot.
 
     Signed distance fields are left out.  Without an MJCF, there are no bodies.
     """
