@@ -1,1 +1,1 @@
-"""From settings and requirements to a constrained problem."""
+"""Build a constrained problem from settings and requirements."""

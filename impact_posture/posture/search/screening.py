@@ -60,7 +60,7 @@ _HITS = 12
 # Degrees of freedom up to which ``_HITS`` suffices.  Each further degree doubles the number, because the number of
 # optima grows exponentially with the degrees of freedom.
 _FREE = 5
-# Least number of ended descents.
+# The search stops only after this number of descents has ended.
 _ENDS = 256
 # The search stops only if the last descents, this fraction of all ended descents, did not lower the best merit.
 _IDLE = 0.5
