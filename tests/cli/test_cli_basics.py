@@ -21,7 +21,8 @@ from impact_posture.robot.robot_loader import known_robots
 from impact_posture_cli import error_boundary as boundary
 from impact_posture_cli.argv import split_vectors
 from tests.support.command import run as start
-from tests.support.helpers import frame_jacobian, mass_matrix, relative, robot
+from tests.support.helpers import relative, robot
+from tests.support.pinocchio_values import frame_jacobian, mass_matrix
 
 COMMAND = Path(sys.executable).parent / "impact-posture"
 HEAVY = ("numpy", "casadi", "pinocchio", "matplotlib", "pydantic", "scipy", "yaml")

@@ -26,15 +26,8 @@ from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.system.toolchain import run_compiler
-from tests.support.helpers import (
-    Vector,
-    assert_close,
-    central_gradient,
-    frame_placement,
-    random_configurations,
-    robot,
-    unit,
-)
+from tests.support.helpers import Vector, assert_close, random_configurations, robot, unit
+from tests.support.pinocchio_values import central_gradient, frame_placement
 from tests.support.tools import cxx_compiler, eigen_headers, need_compiler
 
 DOCS = Path(__file__).parents[2] / "docs"

@@ -21,18 +21,8 @@ from impact_posture.dynamics.spatial import template
 from impact_posture.dynamics.tree import PointOnLink, Tree, Wrench
 from impact_posture.errors import UnsupportedJoint
 from impact_posture.robot.urdf import build_model
-from tests.support.helpers import (
-    NAMES,
-    Vector,
-    assert_close,
-    central_gradient,
-    frame_jacobian,
-    frame_placement,
-    mass_matrix,
-    random_configurations,
-    rng,
-    robot,
-)
+from tests.support.helpers import NAMES, Vector, assert_close, random_configurations, rng, robot
+from tests.support.pinocchio_values import central_gradient, frame_jacobian, frame_placement, mass_matrix
 from tests.support.tangent import composite_mass_matrix
 
 TOLERANCE = 1e-10

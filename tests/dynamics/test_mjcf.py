@@ -19,17 +19,8 @@ from impact_posture.errors import InputError
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.robot.urdf import build_model
 from tests.dynamics.test_dynamics import JOINTS, random_tree, write_urdf
-from tests.support.helpers import (
-    NAMES,
-    Vector,
-    assert_close,
-    frame_jacobian,
-    frame_placement,
-    mass_matrix,
-    random_configurations,
-    rng,
-    robot,
-)
+from tests.support.helpers import NAMES, Vector, assert_close, random_configurations, rng, robot
+from tests.support.pinocchio_values import frame_jacobian, frame_placement, mass_matrix
 
 mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")
 

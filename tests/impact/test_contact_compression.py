@@ -37,7 +37,8 @@ from impact_posture.robot.joint_model import with_joint_model
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_spec import TransmissionSpec
 from tests.support.command import run
-from tests.support.helpers import central_gradient, random_configurations, relative, robot
+from tests.support.helpers import random_configurations, relative, robot
+from tests.support.pinocchio_values import central_gradient
 from tests.support.settings import make_settings
 
 masses, speeds = st.floats(0.05, 500.0), st.floats(0.01, 20.0)

@@ -23,7 +23,8 @@ from impact_posture.posture.search.multistart import solve
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_spec import Support
 from tests.support.command import run
-from tests.support.helpers import assert_close, central_gradient, frame_jacobian, mass_matrix, robot
+from tests.support.helpers import assert_close, robot
+from tests.support.pinocchio_values import central_gradient, frame_jacobian, mass_matrix
 from tests.support.settings import make_settings
 
 FEET = {"solo8": 4, "solo12": 4, "talos": 2}

@@ -22,7 +22,8 @@ from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.robot import Robot
 from tests.impact.test_impact import SOME, WHOLE, combinations, describe
 from tests.support.arms import TIP, X, Y, Z, arm
-from tests.support.helpers import Vector, assert_close, central_gradient, random_configurations, rng, unit
+from tests.support.helpers import Vector, assert_close, random_configurations, rng, unit
+from tests.support.pinocchio_values import central_gradient
 
 FRICTIONS = (0.0, 0.1, 0.5, 2.0)
 STEP = 2e-4

@@ -21,17 +21,8 @@ from impact_posture.robot.joint_model import with_joint_model
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_spec import JointTransmissionSpec, TransmissionSpec
 from tests.support.arms import TIP, Y, arm, seven_joints
-from tests.support.helpers import (
-    Vector,
-    assert_close,
-    central_gradient,
-    frame_jacobian,
-    frame_placement,
-    mass_matrix,
-    rng,
-    robot,
-    unit,
-)
+from tests.support.helpers import Vector, assert_close, rng, robot, unit
+from tests.support.pinocchio_values import central_gradient, frame_jacobian, frame_placement, mass_matrix
 
 STEP = 2e-4
 

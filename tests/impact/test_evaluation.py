@@ -20,15 +20,8 @@ from impact_posture.impact.support_compliance import default_compliance
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_spec import Support
-from tests.support.helpers import (
-    assert_close,
-    frame_jacobian,
-    frame_placement,
-    mass_matrix,
-    rng,
-    robot,
-    unit,
-)
+from tests.support.helpers import assert_close, rng, robot, unit
+from tests.support.pinocchio_values import frame_jacobian, frame_placement, mass_matrix
 from tests.support.urdfs import joint, link, write
 
 DESIGN_KEYS = {

@@ -24,13 +24,8 @@ from impact_posture.posture.manifold.feasible_start import feasible_start
 from impact_posture.posture.search.growing_search import feasible
 from impact_posture.posture.search.multistart import solve
 from tests.support.command import refused, run
-from tests.support.helpers import (
-    Vector,
-    central_gradient,
-    random_configurations,
-    relative,
-    uncoupled,
-)
+from tests.support.helpers import Vector, random_configurations, relative, uncoupled
+from tests.support.pinocchio_values import central_gradient
 from tests.support.settings import make_settings
 
 FRAMES = {"tilthex_arm": "ee", "panda": "panda_hand_tcp", "ur5": "tool0"}

@@ -22,19 +22,8 @@ from impact_posture.impact.support_compliance import default_compliance
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_spec import Support
-from tests.support.helpers import (
-    NAMES,
-    Vector,
-    assert_close,
-    central_gradient,
-    frame_jacobian,
-    frame_placement,
-    mass_matrix,
-    random_configurations,
-    rng,
-    robot,
-    unit,
-)
+from tests.support.helpers import NAMES, Vector, assert_close, random_configurations, rng, robot, unit
+from tests.support.pinocchio_values import central_gradient, frame_jacobian, frame_placement, mass_matrix
 
 KINDS: tuple[ObjectiveKind, ...] = ("impulse", "speed", "sticking", "energy")
 OFFSET = (0.01, -0.02, 0.03)

@@ -25,9 +25,6 @@ from tests.support.helpers import (
     NAMES,
     Vector,
     assert_close,
-    central_gradient,
-    frame_jacobian,
-    mass_matrix,
     random_configurations,
     relative,
     rng,
@@ -35,6 +32,7 @@ from tests.support.helpers import (
     uncoupled,
     unit,
 )
+from tests.support.pinocchio_values import central_gradient, frame_jacobian, mass_matrix
 
 FLOATING = [name for name in NAMES if robot(name).floating]
 STANDING = [name for name in NAMES if robot(name).spec.supports]

@@ -31,18 +31,8 @@ from impact_posture.posture.search.growing_search import run_start
 from impact_posture.posture.search.multistart import solve
 from impact_posture.robot.robot_loader import load_robot
 from tests.support.command import run
-from tests.support.helpers import (
-    assert_close,
-    central_gradient,
-    frame_jacobian,
-    mass_matrix,
-    random_configurations,
-    relative,
-    rng,
-    robot,
-    uncoupled,
-    unit,
-)
+from tests.support.helpers import assert_close, random_configurations, relative, rng, robot, uncoupled, unit
+from tests.support.pinocchio_values import central_gradient, frame_jacobian, mass_matrix
 from tests.support.settings import make_settings
 from tests.support.tools import need_compiler
 

@@ -27,18 +27,8 @@ from impact_posture.posture.search.multistart import solve
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_spec import RobotSpec, Support
 from tests.dynamics.test_dynamics import random_tree
-from tests.support.helpers import (
-    assert_close,
-    central_gradient,
-    frame_jacobian,
-    frame_placement,
-    mass_matrix,
-    random_configurations,
-    relative,
-    rng,
-    robot,
-    unit,
-)
+from tests.support.helpers import assert_close, random_configurations, relative, rng, robot, unit
+from tests.support.pinocchio_values import central_gradient, frame_jacobian, frame_placement, mass_matrix
 from tests.support.settings import make_settings
 
 HANDS = ("gripper_right_base_link", "gripper_left_base_link")

@@ -29,7 +29,8 @@ from impact_posture.verification.verification import verify
 from tests.support.exact import Exact, ExactImpact, digits, distance, exact, rounded
 from tests.support.exact_bounds import Bounded
 from tests.support.exported import Exported, built
-from tests.support.helpers import Vector, central_gradient, random_configurations, rng, robot, unit
+from tests.support.helpers import Vector, random_configurations, rng, robot, unit
+from tests.support.pinocchio_values import central_gradient
 from tests.support.rigid import Rigid
 from tests.support.rounding import other_rounding
 

@@ -34,7 +34,7 @@ from impact_posture.posture.search.growing_search import feasible
 from impact_posture.posture.search.multistart import solve
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
-from tests.support.helpers import central_gradient
+from tests.support.pinocchio_values import central_gradient
 
 BOX = np.array(list(product((-0.04, 0.05), (-0.03, 0.06), (-0.05, 0.07))))
 ROBOTS = ("tilthex_arm", "talos", "panda", "kinova")

@@ -32,7 +32,8 @@ from impact_posture.posture.search.growing_search import run_start
 from impact_posture.posture.search.multistart import solve
 from impact_posture.robot.actuation import allocation_matrix, hover, torque_limits
 from tests.support.constraints import check_lifted_rows
-from tests.support.helpers import Vector, assert_close, central_gradient, frame_jacobian, rng
+from tests.support.helpers import Vector, assert_close, rng
+from tests.support.pinocchio_values import central_gradient, frame_jacobian
 from tests.support.settings import make_settings
 
 SIZE = st.integers(0, 2**32 - 1)

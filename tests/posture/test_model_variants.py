@@ -25,17 +25,8 @@ from impact_posture.posture.formulation.problem_file import dump_settings, prepa
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem
 from impact_posture.posture.search.multistart import solve
 from impact_posture.robot.model_variant import MOST_VARIANTS, Payload, between, build_model_variants
-from tests.support.helpers import (
-    assert_close,
-    central_gradient,
-    frame_jacobian,
-    mass_matrix,
-    random_configurations,
-    relative,
-    rng,
-    robot,
-    unit,
-)
+from tests.support.helpers import assert_close, random_configurations, relative, rng, robot, unit
+from tests.support.pinocchio_values import central_gradient, frame_jacobian, mass_matrix
 from tests.support.settings import make_settings
 
 FRAMES = {"tilthex_arm": "ee", "panda": "panda_hand_tcp", "bolt": "base_link", "talos": "gripper_right_base_link"}

@@ -28,7 +28,7 @@ from impact_posture.posture.search.multistart import Optimum, distinct, hits_of_
 from impact_posture.system.arrays import nonnegative_least_squares, null_space
 from tests.output.views import PENDULUM
 from tests.support.biped import biped
-from tests.support.helpers import central_gradient
+from tests.support.pinocchio_values import central_gradient
 from tests.support.settings import make_settings
 
 

@@ -29,7 +29,8 @@ from impact_posture.posture.search.multistart import PostureSolution, solve
 from impact_posture_cli.argv import put_right
 from tests.posture.test_posture import walk
 from tests.support.command import run
-from tests.support.helpers import central_gradient, relative, rng
+from tests.support.helpers import relative, rng
+from tests.support.pinocchio_values import central_gradient
 from tests.support.settings import make_settings
 
 CASES: dict[str, dict[str, object]] = {

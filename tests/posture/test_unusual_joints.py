@@ -21,7 +21,7 @@ from impact_posture.posture.manifold.feasible_start import feasible_start
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem
 from impact_posture.posture.search.growing_search import feasible
 from impact_posture.posture.search.multistart import solve
-from tests.support.helpers import central_gradient
+from tests.support.pinocchio_values import central_gradient
 from tests.support.urdfs import MOVED, joint, link, load, write
 
 LINKS = (link("stand", 5), link("upper", 2, "0.2 0 0"), link("fore", 1.5, "0.2 0 0"), link("palm", 0.5, "0.05 0 0"))

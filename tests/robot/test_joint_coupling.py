@@ -26,8 +26,9 @@ from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.robot.urdf import example_robot_data
 from impact_posture.system.libraries import build_library, load_library
-from tests.support.helpers import Vector, assert_close, central_gradient, mass_matrix, robot, unit
+from tests.support.helpers import Vector, assert_close, robot, unit
 from tests.support.mjcfs import ARM
+from tests.support.pinocchio_values import central_gradient, mass_matrix
 from tests.support.urdfs import MOVED, joint, link, load, write
 
 FINGERS = MOVED.replace("-2.5", "0").replace("2.5", "0.04")

@@ -32,7 +32,8 @@ from impact_posture.robot.robot_spec import JointTransmissionSpec, TransmissionS
 from impact_posture.system.libraries import build_library
 from tests.support.arms import TIP, X, Y, Z, arm
 from tests.support.command import run
-from tests.support.helpers import assert_close, central_gradient, random_configurations, relative, rng, robot, unit
+from tests.support.helpers import assert_close, random_configurations, relative, rng, robot, unit
+from tests.support.pinocchio_values import central_gradient
 from tests.support.settings import make_settings
 from tests.support.tools import need_compiler
 

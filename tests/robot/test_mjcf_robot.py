@@ -23,9 +23,10 @@ from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.verification.verification import verify
-from tests.support.helpers import frame_placement, mass_matrix, rng
+from tests.support.helpers import rng
 from tests.support.helpers import robot as known_robot
 from tests.support.mjcfs import ALL, ARM, MESH, ODD, QUADRUPED
+from tests.support.pinocchio_values import frame_placement, mass_matrix
 
 mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")
 

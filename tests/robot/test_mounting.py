@@ -13,7 +13,8 @@ from impact_posture.config.problem_settings import LoadOptions
 from impact_posture.errors import ImpactPostureError, InputError, JointNotFound
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.simulation.scenario_file import read_scenario
-from tests.support.helpers import frame_placement, mass_matrix, rng
+from tests.support.helpers import rng
+from tests.support.pinocchio_values import frame_placement, mass_matrix
 
 MOVED = (-0.08, 0.02, 0.01)
 

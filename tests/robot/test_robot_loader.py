@@ -27,7 +27,8 @@ from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.impact.quantities.impact_oracle import ImpactOracle
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.robot.urdf import example_robot_data
-from tests.support.helpers import NAMES, assert_close, mass_matrix, random_configurations, robot
+from tests.support.helpers import NAMES, assert_close, random_configurations, robot
+from tests.support.pinocchio_values import mass_matrix
 
 UR5 = "example-robot-data:ur_description/urdf/ur5_robot.urdf"
 

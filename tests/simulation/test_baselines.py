@@ -24,7 +24,8 @@ from impact_posture.simulation.world.actuator_command import ActuatorCommand
 from impact_posture.simulation.world.sensor_noise import Reading
 from impact_posture.tsid.tasks.task import Task
 from tests.simulation.factories import SHIPPED, shared_factory
-from tests.support.helpers import Vector, central_gradient, frame_jacobian, mass_matrix, rng
+from tests.support.helpers import Vector, rng
+from tests.support.pinocchio_values import central_gradient, frame_jacobian, mass_matrix
 
 
 def moving(factory: ControllerFactory, *key: object) -> Reading:

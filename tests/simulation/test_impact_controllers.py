@@ -11,7 +11,8 @@ from impact_posture.simulation.metrics import before
 from impact_posture.simulation.scenario_file import RepeatedContacts
 from impact_posture.simulation.world.sensor_noise import Reading
 from tests.simulation.factories import lived, shared_factory
-from tests.support.helpers import Vector, frame_jacobian, mass_matrix, rng
+from tests.support.helpers import Vector, rng
+from tests.support.pinocchio_values import frame_jacobian, mass_matrix
 
 NAME = "aerial-vertical"
 

@@ -28,8 +28,9 @@ from impact_posture.simulation.world.world import build_world
 from impact_posture.simulation.world.world_builder import build_scene
 from tests.dynamics.test_mjcf import qacc
 from tests.simulation.factories import HIT, controller_factory, driven
-from tests.support.helpers import assert_close, mass_matrix, rng
+from tests.support.helpers import assert_close, rng
 from tests.support.mjcfs import ARM, MESH, ODD, QUADRUPED
+from tests.support.pinocchio_values import mass_matrix
 
 mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")
 

@@ -23,7 +23,8 @@ from impact_posture.simulation.world.scene import Physics, Sensors
 from impact_posture.simulation.world.world import build_world
 from impact_posture.tsid.controller import Command, Status
 from tests.simulation.factories import driven, shared_factory
-from tests.support.helpers import Vector, frame_jacobian, mass_matrix
+from tests.support.helpers import Vector
+from tests.support.pinocchio_values import frame_jacobian, mass_matrix
 
 NONE = np.zeros(0)
 WEIGHTLESS = Physics(gravity=(0.0, 0.0, 0.0))

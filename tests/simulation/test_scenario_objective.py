@@ -30,8 +30,9 @@ from impact_posture.simulation.scenario_objective import compiled, interpreted, 
 from impact_posture.simulation.setup import set_up
 from impact_posture.system.libraries import hash_path
 from tests.simulation.factories import shared_factory
-from tests.support.helpers import Vector, assert_close, central_gradient, frame_jacobian, mass_matrix, rng
+from tests.support.helpers import Vector, assert_close, rng
 from tests.support.helpers import robot as known_robot
+from tests.support.pinocchio_values import central_gradient, frame_jacobian, mass_matrix
 from tests.support.tools import need_compiler
 
 # Robots with fixed and floating bases, with joints of several coordinates, with and without feet.

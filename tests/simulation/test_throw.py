@@ -22,7 +22,8 @@ from impact_posture.simulation.world.actuator_command import ActuatorCommand
 from impact_posture.simulation.world.throw import FLIGHT, Throw, thrown_jumps
 from impact_posture.simulation.world.world import World, build_world
 from tests.simulation.factories import controller_factory
-from tests.support.helpers import Vector, frame_jacobian, mass_matrix
+from tests.support.helpers import Vector
+from tests.support.pinocchio_values import frame_jacobian, mass_matrix
 
 # Scenario of the throw, flight direction of the ball, and sign.
 THROWS = [("solo8-throw", (-1, 0, 0), 1), ("solo8-throw", (0.3, -0.4, -1.0), -1), ("talos-throw", (0.5, 1.0, 0.0), 1)]

@@ -22,9 +22,10 @@ from impact_posture.simulation.world.scene import Physics, Scene, Sensors, Shape
 from impact_posture.simulation.world.world import World, build_world
 from impact_posture.simulation.world.world_builder import build_scene
 from tests.dynamics.test_mjcf import qacc
-from tests.support.helpers import NAMES, Vector, assert_close, mass_matrix, random_configurations, rng
+from tests.support.helpers import NAMES, Vector, assert_close, random_configurations, rng
 from tests.support.helpers import robot as known_robot
 from tests.support.mjcfs import ARM as MJCF_ARM
+from tests.support.pinocchio_values import mass_matrix
 from tests.support.restitution import ball
 
 mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")

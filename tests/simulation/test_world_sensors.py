@@ -29,8 +29,9 @@ from impact_posture.simulation.world.contact_law import ContactLaw
 from impact_posture.simulation.world.rotors import Vibration
 from impact_posture.simulation.world.scene import Physics, Scene, Sensors, Shape, Surface
 from impact_posture.simulation.world.world import World, build_world
-from tests.support.helpers import assert_close, mass_matrix, random_configurations
+from tests.support.helpers import assert_close, random_configurations
 from tests.support.helpers import robot as known_robot
+from tests.support.pinocchio_values import mass_matrix
 from tests.support.restitution import ball, ideal_restitution, measure_restitution
 
 PAGE = Path(__file__).parents[2] / "docs" / "generated" / "restitution.md"

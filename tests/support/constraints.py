@@ -12,7 +12,8 @@ from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import Tree
 from impact_posture.posture.constraints.constraint import Constraint, ExpressionConstraint
-from tests.support.helpers import Vector, assert_close, central_gradient, rng
+from tests.support.helpers import Vector, assert_close, rng
+from tests.support.pinocchio_values import central_gradient
 
 
 def check_expression(

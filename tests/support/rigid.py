@@ -6,7 +6,8 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
-from tests.support.helpers import Vector, frame_jacobian, mass_matrix
+from tests.support.helpers import Vector
+from tests.support.pinocchio_values import frame_jacobian, mass_matrix
 
 
 class Rigid:

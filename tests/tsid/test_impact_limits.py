@@ -16,7 +16,8 @@ from impact_posture.tsid.support_contact import SupportContact, support_contacts
 from impact_posture.tsid.task_formulation import TaskFormulation
 from impact_posture.tsid.tasks.frame_tasks import FramePosition
 from impact_posture.tsid.tasks.joint_posture import JointPosture
-from tests.support.helpers import Vector, frame_jacobian, mass_matrix, rng, robot, unit
+from tests.support.helpers import Vector, rng, robot, unit
+from tests.support.pinocchio_values import frame_jacobian, mass_matrix
 
 ROBOTS = {"tilthex_arm": "ee", "panda": "panda_hand", "solo12": "base_link", "talos": "gripper_left_base_link"}
 

@@ -32,7 +32,8 @@ from impact_posture.tsid.task_formulation import aerial_formulation, legged_form
 from impact_posture.tsid.tasks.activation import Activation, Phase
 from impact_posture.tsid.tasks.impact_robust import ImpactRobustPosture, curvature_scale, gradient_of
 from impact_posture.tsid.tasks.joint_posture import JointPosture
-from tests.support.helpers import central_gradient, rng, robot
+from tests.support.helpers import rng, robot
+from tests.support.pinocchio_values import central_gradient
 from tests.support.step_bounds import step_bound
 from tests.support.tools import need_compiler
 from tests.tsid.test_tsid_controller import DT, assert_dynamics, assert_limits, integrate, run

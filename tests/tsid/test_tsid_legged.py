@@ -13,7 +13,8 @@ from impact_posture.tsid.point_kinematics import Point
 from impact_posture.tsid.support_contact import SupportContact, point_cone, support_contacts, surface_cone, to_world
 from impact_posture.tsid.task_formulation import legged_formulation
 from impact_posture.tsid.tasks.joint_posture import JointPosture
-from tests.support.helpers import frame_jacobian, mass_matrix, rng, robot
+from tests.support.helpers import rng, robot
+from tests.support.pinocchio_values import frame_jacobian, mass_matrix
 from tests.tsid.test_tsid_controller import DT, assert_dynamics, assert_limits, run
 
 LEGGED = ("solo8", "talos", "solo12")

@@ -20,15 +20,8 @@ from impact_posture.tsid.tasks.body_tasks import BaseOrientation, CenterOfMass, 
 from impact_posture.tsid.tasks.frame_tasks import FrameAligned, FramePose, FramePosition, Impedance
 from impact_posture.tsid.tasks.joint_posture import JointPosture
 from impact_posture.tsid.tasks.task import Task, TaskStack
-from tests.support.helpers import (
-    assert_close,
-    frame_jacobian,
-    frame_placement,
-    mass_matrix,
-    random_configurations,
-    rng,
-    robot,
-)
+from tests.support.helpers import assert_close, random_configurations, rng, robot
+from tests.support.pinocchio_values import frame_jacobian, frame_placement, mass_matrix
 from tests.support.step_bounds import step_bound
 
 H = 1e-6
