@@ -127,13 +127,18 @@ def tips(robot: Robot, feet: Sequence[str] = ()) -> tuple[str, ...]:
 
 
 def fingers(robot: Robot) -> tuple[str, ...]:
-    """Return the joints with a name like "finger" or "gripper", and all joints after them."""
+    """Return the joints with a name like "finger" or "gripper", and all joints after them.
+
+    The result is empty if nothing else moves, because the robot is then a hand, whose fingers are hit.
+    """
     names = robot.model.names
-    return tuple(
+    moving = tuple(
         joint
         for joint in robot.joint_names
         if any(_FINGER.search(str(names[i])) for i in chain(robot, robot.joint_id(joint)))
     )
+    palm_moves = robot.model.frames[robot.frame_id(base_frame(robot))].parentJoint > 0
+    return moving if palm_moves or len(moving) < len(robot.joint_names) else ()
 
 
 def base_frame(robot: Robot) -> str:

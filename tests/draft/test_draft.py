@@ -255,3 +255,19 @@ def test_the_example_is_the_same_arm_as_a_urdf_and_as_an_mjcf(tmp_path: Path) ->
     assert torque_limits(arms[0].model).tolist() == torque_limits(arms[1].model).tolist()
     values = [ImpactOracle(case).quantities(case.robot.posture()).H for case in (mjcf, urdf)]
     assert values[0] == pytest.approx(values[1], rel=1e-9)
+
+
+def test_the_contact_of_a_hand_without_an_arm_is_a_finger(tmp_path: Path) -> None:
+    mass = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+    parts, above = ['<link name="palm"/>'], "palm"
+    for name in ("index_pip", "index_dip"):
+        parts.append(
+            f'<link name="{name}_link">{mass}</link><joint name="{name}" type="revolute"><axis xyz="0 1 0"/>'
+        )
+        parts.append(f'<origin xyz=".1 0 0"/><parent link="{above}"/><child link="{name}_link"/>')
+        parts.append('<limit lower="0" upper="1" effort="1" velocity="1"/></joint>')
+        above = f"{name}_link"
+    (tmp_path / "hand.urdf").write_text(f'<robot name="hand">{"".join(parts)}</robot>')
+    out, _ = write_draft(str(tmp_path / "hand.urdf"), LoadOptions(), tmp_path / "draft.toml")
+    spec = read_spec(out)
+    assert spec.contact.frame == above and not spec.constraints.hold

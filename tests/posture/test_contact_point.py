@@ -78,3 +78,39 @@ def test_several_contacts_keep_the_option_because_one_offset_cannot_hold_them(tm
 def test_front_and_offset_together_are_refused(tmp_path: Path) -> None:
     command = ("evaluate", "ur5", *TASK[:4], "--contact-point", "front", "--offset", 0, 0, 0.1)
     refused(run(*command, cwd=tmp_path), 1, "contradicts --offset")
+
+
+def test_a_conflict_names_the_front_if_the_front_has_no_conflict(tmp_path: Path) -> None:
+    """While the wrist stays in place, the elbow is in the ground.  While the tip stays in place, it can rise."""
+    parts, angles = ['<link name="base"/>'], {"shoulder": 0.585, "elbow": -1.17, "wrist": 1.1}
+    above = "base"
+    for joint, at, length, high in (("shoulder", 0.0, 0.3, 1.6), ("elbow", 0.3, 0.3, -0.1), ("wrist", 0.3, 0.2, 2.5)):
+        parts.append(
+            f'<link name="{joint}_link"><inertial><origin xyz="{length / 2} 0 0"/><mass value="1"/>'
+            '<inertia ixx=".01" iyy=".01" izz=".01" ixy="0" ixz="0" iyz="0"/></inertial>'
+            f'<collision><origin xyz="{length} 0 0"/><geometry><sphere radius=".02"/></geometry></collision></link>'
+            f'<joint name="{joint}" type="revolute"><origin xyz="{at} 0 0"/><axis xyz="0 1 0"/>'
+            f'<parent link="{above}"/><child link="{joint}_link"/>'
+            f'<limit lower="-2.5" upper="{high}" effort="100" velocity="3"/></joint>'
+        )
+        above = f"{joint}_link"
+    (tmp_path / "arm.urdf").write_text(f'<robot name="arm">{"".join(parts)}</robot>')
+    (tmp_path / "start.json").write_text(json.dumps({"joints": angles}))
+    task = (
+        "arm.urdf",
+        "--frame",
+        above,
+        "--normal",
+        0,
+        0,
+        1,
+        "--posture",
+        "start.json",
+        "--contact-pose",
+        "position",
+    )
+    more = ("--starts", 1, "--jobs", 1, "--no-codegen", "--format", "png", "--out", "out")
+    done = run("optimize", *task, *more, cwd=tmp_path)
+    hint = "put the contact point at the front of its links (--contact-point front), which is possible"
+    refused(done, 3, "shoulder_link / surface at wrist_link", hint)
+    assert run("optimize", *task, *more, "--contact-point", "front", cwd=tmp_path).returncode == 0

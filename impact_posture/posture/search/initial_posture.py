@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 
 from impact_posture.errors import ContactError, ImpactPostureError, Infeasible, SolverFailed
+from impact_posture.impact.contact_point import at_front, early_touches
+from impact_posture.impact.objective import Objective
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.posture.approach.approach_speed import ApproachSpeed
+from impact_posture.posture.constraints.requirements import Requirements
 from impact_posture.posture.formulation.build_problem import build_problem
 from impact_posture.posture.manifold.feasible_start import FEASIBLE, Projector, feasible_start
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem
@@ -18,6 +23,8 @@ from impact_posture.system.arrays import Array
 
 # If ``beside`` has this small value, :func:`find_conflicts` stops after a few starts when a conflict remains.
 _QUICK = 1e-9
+# Clearance (m) of the problem that shows whether the clearance is the reason of a conflict.
+_LEAST_CLEARANCE = 1e-4
 # If no posture allows the speed of a strike, the required speed is below the greatest speed by this fraction, so that
 # the program has an interior.
 _SLOWER = 1e-3
@@ -48,17 +55,21 @@ def initial_posture(problem: ConstrainedProblem, seed: int, rows: ProgramRows) -
     least = _slowed(least, seed, program) if problem.requirements.strike else least
     if least.conflicts:
         limits = f"; there {', '.join(least.at_limits[:4])}" if least.at_limits else ""
-        sign = "; check the sign of the normal, which points towards the robot, and how far the `surface` reaches"
-        struck = sign if any(" / surface at " in name for name in least.conflicts) else ""
+        struck = any(" / surface at " in name for name in least.conflicts)
         links = {body.name for body in problem.surroundings.shapes.bodies} if problem.surroundings else set()
         overlap = any({*name.split(" / ")} <= links for name in least.conflicts)
-        design = "; links that touch by design may touch by <disable_collisions> in an SRDF" if overlap else ""
-        raise Infeasible(
-            least.conflicts,
-            least.sizes,
-            hint=f"{_turn_hint(problem, seed)}relax one of them, move the target, or start from another `posture`"
-            f"{struck}{design}{limits}",
-        )
+        hint = f"{_remedy(problem, seed, struck=struck, overlap=overlap)}relax one of them, move the target, or start"
+        hint += " from another `posture`"
+        if struck:
+            hint += (
+                "; check the sign of the normal, which points towards the robot, and how far the `surface` reaches"
+            )
+        if overlap:
+            tag = "<disable_collisions> in an SRDF" if problem.robot.mjcf is None else "<exclude> in the MJCF"
+            hint += f"; links that touch by design may touch by {tag}"
+            if problem.surroundings and not problem.surroundings.collisions(least.q):
+                hint += " (there only the hulls around the links touch, not the links)"
+        raise Infeasible(least.conflicts, least.sizes, hint=hint + limits)
     projection = Projector(problem).project(least.q)
     if projection.violation > FEASIBLE:
         fault = f"no known posture satisfies the constraints; the nearest misses them by {projection.violation:.1e}"
@@ -99,17 +110,31 @@ def _at_speed(problem: ConstrainedProblem, speed: float) -> ConstrainedProblem:
     return replace(problem, constraints=tuple(constraints))
 
 
-def _turn_hint(problem: ConstrainedProblem, seed: int) -> str:
-    """Return a hint if there is no conflict when the contact frame may turn; otherwise return an empty text."""
-    if not problem.objective.contacts or problem.requirements.contact_pose in ("position", "box", "free"):
-        return ""
-    freed = replace(problem.requirements, contact_pose="position", target_quaternion=None)
-    try:
-        turned = build_problem(problem.robot, problem.objective, problem.given, freed)
-        least = find_conflicts(turned, seed, beside=_QUICK)
-    except ImpactPostureError:
-        return ""
-    return "" if least.conflicts else "let the contact frame turn (`contact_pose` position), which is possible; or "
+def _remedy(problem: ConstrainedProblem, seed: int, *, struck: bool, overlap: bool) -> str:
+    """Return the first change of the settings that removes all conflicts, as text; empty if no change does.
+
+    ``struck`` says whether a link conflicts with the surface, and ``overlap`` whether two links conflict.
+    """
+    wanted, objective = problem.requirements, problem.objective
+    changes: list[tuple[str, Objective, Requirements]] = []
+    if struck and isinstance(objective, WorstCaseObjective):
+        robot, q, held = problem.robot, problem.given, wanted.hold
+        if early_touches(robot, objective.contacts, q, held):
+            first, *others = (at_front(robot, contact, q, held) for contact in objective.contacts)
+            moved = replace(objective, contact=first, others=tuple(others))
+            changes.append(("put the contact point at the front of its links (`contact_point` front)", moved, wanted))
+    if objective.contacts and wanted.contact_pose not in ("position", "box", "free"):
+        freed = replace(wanted, contact_pose="position", target_quaternion=None)
+        changes.append(("let the contact frame turn (`contact_pose` position)", objective, freed))
+    if overlap:
+        closer = replace(wanted, clearance=_LEAST_CLEARANCE)
+        changes.append((f"let links come closer (`clearance` below {wanted.clearance:g})", objective, closer))
+    for words, changed, requirements in changes:
+        with suppress(ImpactPostureError):
+            tried = build_problem(problem.robot, changed, problem.given, requirements)
+            if not find_conflicts(tried, seed, beside=_QUICK).conflicts:
+                return f"{words}, which is possible; or "
+    return ""
 
 
 def initial_objective(problem: ConstrainedProblem, initial: Array) -> float:
