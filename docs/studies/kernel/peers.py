@@ -68,7 +68,8 @@ def ours(samples: Samples) -> list[Kernel]:
 
 
 def same_graph(samples: Samples) -> list[Kernel]:
-    """Return kernels for the expressions of our export, but with C code of CasADi, compiled with the same flags."""
+    """Return kernels in which CasADi writes the C code for the expressions of our export, compiled with the same
+    flags."""
     exported = export_library([NamedObjective(samples.objective, "kernel")])
     q, n, _ = exported.function.sx_in()
     values = exported.function.call([q, n, ca.DM(exported.constants)])
