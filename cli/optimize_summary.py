@@ -173,7 +173,7 @@ def _path(page: Page, path: dict[str, Any]) -> None:
             f" ({path['timing']}{bound}), violation {path['max_violation']:.1e}"
         )
     else:
-        page.line("path: the start is the optimum" if path["found"] else "path: none leads away from the start")
+        page.line("path: the start is the optimum" if path["found"] else "path: no path leads away from the start")
     if strike := path.get("strike"):
         page.line(
             f"  strikes at {number(strike['speed'])} m/s, with {strike['share']:.0%} of the velocity limits, after a "
