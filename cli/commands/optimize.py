@@ -143,6 +143,7 @@ def _refuse_idle(typed: TypedSettings, settings: ProblemSettings) -> None:
         ("hold_force", settings.holdable, "--holdable"),
         ("clearance", settings.collision, "--collision"),
         ("surface", settings.collision, "--collision"),
+        ("surface_spread", settings.strike and settings.collision, "--strike and --collision"),
     ):
         if name in typed.values and not used:
             raise typer.BadParameter(f"does nothing without {hint}", param_hint=f"'--{name.replace('_', '-')}'")

@@ -132,6 +132,10 @@ Factors = Annotated[
     tuple[float, float],
     Demand(lambda pair: 0 < pair[0] <= pair[1] < _INFINITE, "two factors above zero, the lower first, such as 0.5 2"),
 ]
+TiltAndShift = Annotated[
+    tuple[float, float],
+    Demand(lambda pair: 0 <= pair[0] <= 45 and 0 <= pair[1] <= 1, "degrees from 0 to 45 and m from 0 to 1"),
+]
 Payloads = Annotated[
     tuple[tuple[str, float], ...],
     Demand(

@@ -25,6 +25,7 @@ from impact_posture.config.demand import (
     Position,
     Positive,
     Share,
+    TiltAndShift,
     UnitQuaternion,
     ZeroOrMore,
     between,
@@ -62,6 +63,8 @@ MATERIALS = {"steel": (200e9, 0.28), "wood": (11.5e9, 0.3), "rubber": (0.03e9, 0
 
 # Default least distance between links that must not touch, m.
 CLEARANCE = 0.001
+# Default tilt, degrees, and shift, m, of the surface of a strike at which only the struck link may touch it.
+SURFACE_SPREAD = (5.0, 0.005)
 # Default edge length of a square surface, m.  The square replaces the endless plane if a foot or a fixed base is
 # behind this plane.
 PATCH = 0.3
@@ -282,6 +285,10 @@ class ProblemSettings(ImpactSettings):
     surface: Annotated[str | float, between(1e-3, 1e3, "m", ("plane", "none"))] | None = setting(
         None, "Surface at the contact: an endless plane, none, or a square of edge length M, m.", LIMITS,
         "plane|none|M", f"the plane, or {PATCH:g} where the robot stands behind it", parse=parse_number_or_name,
+    )  # fmt: skip
+    surface_spread: TiltAndShift = setting(
+        SURFACE_SPREAD, "With --strike, tilt and shift of the surface at which only the struck link touches it.",
+        LIMITS, "DEG M",
     )  # fmt: skip
     obstacles: tuple[Obstacle, ...] = ()
     limit_margin: NonNegative | None = setting(

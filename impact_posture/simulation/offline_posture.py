@@ -6,12 +6,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from impact_posture.config.problem_settings import FRICTION, ProblemSettings
+from impact_posture.config.problem_settings import FRICTION, SURFACE_SPREAD, ProblemSettings
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import Infeasible, SolverFailed
 from impact_posture.impact.impact_contact import point_on
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.posture.analysis.verdict_conditions import near_surface
 from impact_posture.posture.constraints.posture_distance import distance
 from impact_posture.posture.constraints.requirements import Requirements
 from impact_posture.posture.formulation.build_problem import build_problem
@@ -71,7 +72,7 @@ def offline_posture(
     *,
     starts: int = OFFLINE_STARTS,
     at_contact: bool = True,
-    keep_feet: bool = False,
+    strikes: bool = False,
 ) -> OfflinePosture:
     """Optimize the posture for the impact of a scenario.
 
@@ -84,10 +85,12 @@ def offline_posture(
     - The base of a flying robot stays level.
     - The feet of a standing robot stay in place.  The center of mass is above the feet, and the base tilts at most as
       far as the reference flow allows.
-    - With ``keep_feet``, no foot of a standing robot lifts or slides during the impact.
+    - If the robot ``strikes``, only the end effector touches the surface, also if the surface is tilted and shifted
+      as far as ``[spread]`` of the scenario states, or by :data:`SURFACE_SPREAD` if this is more.  No foot of a
+      standing robot lifts or slides during the impact.
 
-    If the search does not reach a posture with all constraints, it drops ``keep_feet``, and then also the constraints
-    on collisions.  The ``note`` of the result states the dropped constraints.
+    If the search does not reach a posture with all constraints, it drops first the tilt and shift, then the demand on
+    the feet, and then the constraints on collisions.  The ``note`` of the result states the dropped constraints.
 
     Raises:
         Infeasible, SolverFailed: The same errors as in :func:`impact_posture.posture.search.multistart.solve`.
@@ -96,7 +99,11 @@ def offline_posture(
     wanted, notes = scenario_requirements(setup, objective, at_contact=at_contact), dict[tuple[bool, bool], str]()
     # A robot that does not stand has no support polygon, so the second margin is zero.
     margins = dict.fromkeys((stops, edges if wanted.com_over_feet else 0.0) for stops, edges in _MARGINS)
-    kept = keep_feet and bool(objective.supports)
+    if strikes:
+        tilt, shift = SURFACE_SPREAD
+        spread = max(tilt, setup.scenario.spread.normal), max(shift, setup.scenario.spread.gap)
+        wanted = replace(wanted, strike=True, surface_spread=spread)
+    kept = strikes and bool(objective.supports)
     levels = dict.fromkeys(((kept, True), (False, True), (False, False)))
     attempts = [(*level, *margin) for level in levels for margin in margins]
     for keep, collision, stops, edges in attempts:
@@ -117,7 +124,10 @@ def offline_posture(
         value, initial = objective.value(solution.q), objective.value(solution.initial)
         moved = distance(Chart(setup.robot.model), solution.q, solution.initial)
         notes.pop((keep, collision), None)
-        return OfflinePosture(solution, value, initial, moved, "; ".join(notes.values()))
+        lines = list(notes.values())
+        if (clear := solution.problem.requirements.surface_spread) != demands.surface_spread:
+            lines.append(near_surface(*clear))
+        return OfflinePosture(solution, value, initial, moved, "; ".join(lines))
     raise AssertionError("the last attempt returns or raises")
 
 

@@ -190,8 +190,10 @@ def _contacts(loop: _Loop, task: RepeatedContacts, mode: Mode) -> Run:
     events = [(BRACE, driver.brace)]
     if mode == "held":
         events.append((max(BRACE, starts[0] - 2 * loop.ramp), driver.hold))
-    # At the start of each approach, tell the controller the expected time of the impact.
-    events += [(start, partial(driver.expect, start + reference.crossing)) for start in starts]
+    # At the start of each approach, or earlier if needed, tell the controller the expected time of the impact.
+    for start in starts:
+        due = start + reference.crossing
+        events.append((min(start, max(BRACE, due - driver.ahead)), partial(driver.expect, due)))
     events.sort(key=lambda event: event[0])
     left = round(reference.total / loop.period)
     while left and loop.away is None:

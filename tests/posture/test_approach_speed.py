@@ -21,7 +21,6 @@ from impact_posture.posture.approach.approach_speed import ApproachSpeed
 from impact_posture.posture.approach.attainable_speed import _ROOM, USABLE, AttainableSpeed
 from impact_posture.posture.formulation.problem_file import Prepared, prepare
 from impact_posture.posture.manifold.feasible_start import feasible_start
-from impact_posture.posture.program.program_rows import ProgramRows
 from impact_posture.posture.search.growing_search import feasible
 from impact_posture.posture.search.initial_posture import _at_speed, initial_posture
 from impact_posture.posture.search.multistart import solve
@@ -197,7 +196,7 @@ def test_a_strike_beyond_the_joints_gets_the_greatest_speed() -> None:
 def test_a_clearance_that_conflicts_with_the_speed_of_a_strike_slows_it() -> None:
     """At 1 m/s, a link of panda would touch the wall.  No random posture without collisions is much faster."""
     posed = prepared("panda", 1.0, strike=True, normal=(-1, 0, 0), hold=None, collision=True)
-    problem, q = initial_posture(posed.problem, 0, ProgramRows(posed.problem))
+    problem, q, _ = initial_posture(posed.problem, 0)
     (required,) = (c for c in problem.constraints if isinstance(c, ApproachSpeed))
     assert feasible(problem, q) and required.speed < 1
     attainable = AttainableSpeed(posed.problem.robot, posed.problem.objective, posed.problem.requirements)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+from dataclasses import replace
 from itertools import product
 
 import casadi as ca
@@ -22,12 +23,14 @@ from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import PointOnLink, Tree
 from impact_posture.errors import Infeasible, InputError
 from impact_posture.impact.impact_contact import point_on
-from impact_posture.posture.constraints.clearance import Clearance
+from impact_posture.posture.analysis.verdict_conditions import Circumstances, _surface
+from impact_posture.posture.constraints.clearance import Clearance, SpreadClearance
 from impact_posture.posture.constraints.pair_distances import PairDistances
 from impact_posture.posture.constraints.separating_plane import EQUATIONS, ConvexBody, SeparatingPlane
 from impact_posture.posture.formulation.build_problem import retarget
 from impact_posture.posture.formulation.problem_file import prepare
 from impact_posture.posture.manifold.feasible_start import Projector, random_posture
+from impact_posture.posture.program.constrained_problem import ConstrainedProblem
 from impact_posture.posture.program.posture_nlp import build_nlp
 from impact_posture.posture.search.conflicts import ElasticProgram, find_conflicts
 from impact_posture.posture.search.growing_search import feasible
@@ -316,6 +319,61 @@ def test_a_surface_lies_where_the_link_of_the_contact_reaches(name: str, normal:
     assert not touched(-1e-6)
     # A swept hull is a few millimeters larger than the mesh that it contains.
     assert touched(0.015)
+
+
+STRIKE = {"robot": "tilthex_arm", "normal": (-1, 0, 0), "speed": 0.3, "path": True, "strike": True}
+
+
+def _touched(problem: ConstrainedProblem, q: np.ndarray, tilt: float, shift: float, width: float) -> bool:
+    """Whether coal reports that a mesh of another link touches the surface, tilted to any of 16 sides and shifted."""
+    around, contact, model = problem.surroundings, problem.objective.contact, problem.robot.model
+    assert around is not None
+    point, data = point_on(problem.robot, contact.frame, contact.offset), model.createData()
+    pin.forwardKinematics(model, data, q)
+    n, home = np.array(contact.normal), (data.oMi[point.joint] * point.placement).translation
+    center = home - around.depth(contact) * n
+    # The tip turns with the last link, so both may touch the surface.
+    shapes = [shape for shape in around.shapes.geometry.geometryObjects if shape.parentJoint != point.joint]
+    for heading in np.arange(16) * np.pi / 8:
+        across = np.array([0.0, np.cos(heading), np.sin(heading)])
+        normal = np.cos(np.deg2rad(tilt)) * n + np.sin(np.deg2rad(tilt)) * across
+        place = coal.Transform3s()
+        solid = coal.Halfspace(normal, float(normal @ center) + shift)
+        if np.isfinite(width):
+            turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), normal).matrix()
+            place = coal.Transform3s(turn, center + (shift - width / 2) * normal)
+            solid = coal.Box(width, width, width)
+        for shape in shapes:
+            at, request = data.oMi[shape.parentJoint] * shape.placement, coal.CollisionRequest()
+            there = coal.Transform3s(at.rotation, at.translation)
+            if coal.collide(solid, place, shape.geometry, there, request, coal.CollisionResult()):
+                return True
+    return False
+
+
+@pytest.mark.parametrize("surface", ["plane", 0.4])
+def test_a_posture_that_keeps_the_spread_touches_no_tilted_surface(surface: str | float) -> None:
+    problem = prepare(validate(ProblemSettings, {**STRIKE, "surface": surface}, "options")).problem
+    (spread,) = [c for c in problem.constraints if isinstance(c, SpreadClearance)]
+    rng, numeric, kept, broken = np.random.default_rng(0), Numeric(problem.robot.model), 0, 0
+    for _ in range(60):
+        q = _random(problem.robot, rng)
+        clear = spread.value(numeric.at(q)).min() > 0
+        touched = _touched(problem, q, 5.0, 0.005, np.inf if surface == "plane" else float(surface))
+        assert not (clear and touched)
+        kept, broken = kept + clear, broken + touched
+    assert kept > 3 and broken > 3
+
+
+def test_a_strike_without_room_for_the_spread_requires_half_of_it() -> None:
+    problem = prepare(validate(ProblemSettings, STRIKE, "options")).problem
+    plain = replace(problem, constraints=tuple(c for c in problem.constraints if not isinstance(c, SpreadClearance)))
+    solution, other = solve(problem, starts=1, jobs=1), solve(plain, starts=1, jobs=1)
+    tilt, shift = solution.problem.requirements.surface_spread
+    assert (tilt, shift) == (2.5, 0.0025) and solution.certificate.holds()
+    assert _touched(problem, other.q, tilt, shift, np.inf) and not _touched(problem, solution.q, tilt, shift, np.inf)
+    (line,) = _surface(Circumstances(spread=(tilt, shift)))
+    assert "tilted by more than 2.5° or shifted by more than 2.5 mm" in line.line
 
 
 def test_an_elastic_program_serves_other_targets_and_is_freed() -> None:

@@ -99,11 +99,11 @@ def test_a_note_names_all_dropped_requirements(
 
     def solve(requirements: Requirements, **_: object) -> SimpleNamespace:
         if works(requirements):
-            return SimpleNamespace(q=setup.q, initial=setup.q)
+            return SimpleNamespace(q=setup.q, initial=setup.q, problem=SimpleNamespace(requirements=requirements))
         raise Infeasible({"all": 1.0})
 
     monkeypatch.setattr(offline, "solve", solve)
-    note = offline_posture(setup, scenario_objective(setup), keep_feet=True).note
+    note = offline_posture(setup, scenario_objective(setup), strikes=True).note
     assert [word for word in ("feet may lift", "links may touch") if word in note] == words
     assert bool(note) == bool(words)
 

@@ -67,7 +67,9 @@ def result_document(
     answer = list(postures)[-1]
     struck = path is not None and "strike" in path
     fastest = path["strike"]["speed"] if struck else attainable[answer]  # type: ignore[index]
-    known = Circumstances(fastest, solution.moved, no_path, struck)
+    kept = solution.problem.requirements.surface_spread
+    spread = None if kept == prepared.problem.requirements.surface_spread else kept
+    known = Circumstances(fastest, solution.moved, no_path, struck, spread)
     fault = [solution.compiler_fault] if solution.compiler_fault else []
     at_posture = posture_warnings(prepared, solution.initial, postures[answer], holding[answer], answer)
     told = (warning for evaluation in evaluations.values() for warning in evaluation.warnings)

@@ -29,7 +29,8 @@ class Condition(JsonBlock):
     """One condition of a verdict.
 
     Attributes:
-        key: ``path``, ``arrival``, ``singular``, ``feet``, ``contact point``, ``contact time`` or ``start``.
+        key: ``path``, ``arrival``, ``surface``, ``singular``, ``feet``, ``contact point``,
+            ``contact time`` or ``start``.
         line: The condition in words, without a full stop.
         hint: What the user can do; empty if there is nothing to do.
         refutes: Whether the verdict has no meaning because this condition does not hold.
@@ -51,12 +52,15 @@ class Circumstances:
         moved: Distance from the given to the initial posture, rad mixed with m.
         no_path: Why no path leads to the optimum, and where the path ends; empty if it ends at the optimum.
         strikes: Whether ``attainable`` is the speed at the end of a computed path that strikes the surface.
+        spread: Tilt, degrees, and shift, m, up to which only the struck link touches the surface, if more was
+            required; otherwise ``None``.
     """
 
     attainable: float | None = None
     moved: float = 0.0
     no_path: str = ""
     strikes: bool = False
+    spread: tuple[float, float] | None = None
 
 
 def conditions(
@@ -64,7 +68,7 @@ def conditions(
 ) -> tuple[Condition, ...]:
     """Return the conditions of the verdict on the posture of ``after``, the gravest first."""
     parts = _singular(after), _feet(before, after), _touch(impact, after), _long(impact, before, after), _start(known)
-    return (*_path(known), *_arrival(impact, known), *chain.from_iterable(parts))
+    return (*_path(known), *_arrival(impact, known), *_surface(known), *chain.from_iterable(parts))
 
 
 def _path(known: Circumstances) -> Iterator[Condition]:
@@ -81,6 +85,17 @@ def _arrival(impact: ResolvedImpact, known: Circumstances) -> Iterator[Condition
             "lower the `speed`, or free the pose (`contact_pose`)" if known.strikes else _SLOW,
             refutes=True,
         )
+
+
+def near_surface(tilt: float, shift: float) -> str:
+    """Return words for a strike whose links are clear of the surface only up to this tilt, degrees, and shift, m."""
+    limits = f"tilted by more than {tilt:g}° or shifted by more than {1e3 * shift:g} mm"
+    return f"another link may touch the surface first if it is {limits}"
+
+
+def _surface(known: Circumstances) -> Iterator[Condition]:
+    if known.spread is not None:
+        yield Condition("surface", near_surface(*known.spread), "free the pose (`contact_pose`)")
 
 
 def _singular(after: Evaluation) -> Iterator[Condition]:

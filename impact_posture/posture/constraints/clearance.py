@@ -189,3 +189,9 @@ class Clearance(Constraint):
         unknowns = self._unknowns(auxiliaries) if near else {}
         parts = [self._pairs[k].linearize(model, unknowns.get(k)) for k in near]
         return Linearization.joined(parts, model.model.nv)
+
+
+class SpreadClearance(Clearance):
+    """Clearance to the surface of a strike in all its places within the stated tilt and shift."""
+
+    at_impact = True

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from impact_posture.config.checked import checked
-from impact_posture.config.demand import Lengths, NonNegative, Position, UnitQuaternion
+from impact_posture.config.demand import Lengths, NonNegative, Position, TiltAndShift, UnitQuaternion
 from impact_posture.config.obstacle import Obstacle
-from impact_posture.config.problem_settings import BASE_BOX, BOX, CLEARANCE, FRICTION
+from impact_posture.config.problem_settings import BASE_BOX, BOX, CLEARANCE, FRICTION, SURFACE_SPREAD
 
 
 @checked
@@ -50,6 +50,8 @@ class Requirements:
         clearance: Least distance between links, surface, ground and obstacles if ``collision`` is set, m.
         surface: Shape of the surface: ``plane``, ``none``, or the edge length of a square patch, m; if ``None``, the
             plane or a patch is chosen for the robot.
+        surface_spread: Tilt, degrees, and shift, m, of the surface at which only the struck link may touch it, if
+            ``strike`` is set.  If no posture allows this, the requirement is dropped.
         limit_margin: Least distance of the joint positions from their limits, rad or m.
         regularization: Weight of the squared distance from the initial posture, relative to the initial objective.
     """
@@ -79,6 +81,7 @@ class Requirements:
     collision: bool = False
     clearance: float = CLEARANCE
     surface: str | float | None = None
+    surface_spread: TiltAndShift = SURFACE_SPREAD
     obstacles: tuple[Obstacle, ...] = ()
     limit_margin: NonNegative = 0.0
     regularization: NonNegative = 0.0

@@ -19,7 +19,8 @@ from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import PointOnLink
 from impact_posture.errors import InputError, listed
 from impact_posture.impact.impact_contact import ImpactContact, point_on
-from impact_posture.posture.constraints.clearance import Clearance
+from impact_posture.impact.worst_case.worst_normal import cone_axes
+from impact_posture.posture.constraints.clearance import Clearance, SpreadClearance
 from impact_posture.posture.constraints.linear_joints import LinearJoints
 from impact_posture.posture.constraints.pair_distances import PairDistances
 from impact_posture.posture.constraints.separating_plane import ConvexBody, SeparatingPlane
@@ -32,6 +33,8 @@ from impact_posture.system.arrays import Array
 _BESIDE = 0.03
 # Two contacts can be at the same surface only if the cosine of the angle between their normals exceeds this value.
 _PARALLEL = 0.999
+# Number of tilted surfaces that replace a cone of surfaces.  Between them, the clearance is up to 15 % larger.
+_TILTED = 6
 # If a fixed body lies farther than this, m, behind the plane of the surface, the surface must end before this body.
 _BEHIND = 1e-3
 
@@ -133,6 +136,35 @@ class Surroundings:
         corners = _box_behind(n, width) - depth * n
         hull = SweptHull(name, name, point.joint, corners, 0.0)
         self._walls.append(_Wall(ConvexBody(name, hull, point, turns), exempt))
+
+    def clearance_of_spread(self, contact: ImpactContact, tilt: float, shift: float) -> SpreadClearance | None:
+        """Return the clearance to the surface of a contact that may be tilted and shifted.
+
+        A point whose distance from the contact point is ``r`` along the surface has at least the distance ``clearance
+        + shift + r tan(tilt)`` from the surface, to first order.  The links that may touch the surface are excepted.
+        ``tilt`` is in degrees, and ``shift`` in m.  The surface is tilted towards :data:`_TILTED` sides, by slightly
+        more than ``tilt``, so that these surfaces contain all surfaces between them.  Return ``None`` if the contact
+        has no surface, or no other link.
+        """
+        name = f"surface at {contact.frame}"
+        wall = next((wall for wall in self._walls if wall.body.name == name), None)
+        if wall is None or not (tilt or shift):
+            return None
+        n, links = np.array(contact.normal), [b for b in self._bodies if b.point.joint not in wall.exempt]
+        # The surface turns about the point of the surface that is nearest to the contact point.
+        center, steep = -self.depth(contact) * n, np.arctan(np.tan(np.deg2rad(tilt)) / np.cos(np.pi / _TILTED))
+        pairs, name = list[SeparatingPlane](), f"{name}, tilted by {tilt:g}°"
+        for heading in 2 * np.pi * np.arange(_TILTED if tilt else 1) / _TILTED:
+            tilted = cone_axes(n) @ [np.cos(steep), np.sin(steep) * np.cos(heading), np.sin(steep) * np.sin(heading)]
+            side, hull = replace(wall.body, name=name), wall.body.hull
+            if hull is None:
+                side = replace(side, normal=tilted, offset=float(center @ tilted))
+            else:
+                turn = pin.Quaternion.FromTwoVectors(n, tilted).matrix()
+                side = replace(side, hull=replace(hull, vertices=(hull.vertices - center) @ turn.T + center))
+            pairs += [SeparatingPlane(link, side, self._clearance + shift) for link in links]
+        text = f"links at least {1e3 * (self._clearance + shift):g} mm from the {name}"
+        return SpreadClearance(name, pairs, text) if pairs else None
 
     def add_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
         """Add bodies that are fixed in the world; links that cannot move may touch these bodies.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 
@@ -12,6 +13,7 @@ from impact_posture.impact.contact_point import at_front, early_touches
 from impact_posture.impact.objective import Objective
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.posture.approach.approach_speed import ApproachSpeed
+from impact_posture.posture.constraints.clearance import SpreadClearance
 from impact_posture.posture.constraints.requirements import Requirements
 from impact_posture.posture.formulation.build_problem import build_problem
 from impact_posture.posture.manifold.feasible_start import FEASIBLE, Projector, feasible_start
@@ -28,18 +30,61 @@ _LEAST_CLEARANCE = 1e-4
 # If no posture allows the speed of a strike, the required speed is below the greatest speed by this fraction, so that
 # the program has an interior.
 _SLOWER = 1e-3
+# Shares of the tilt and shift of the surface of a strike that the program tries to require.
+_SHARES = (1.0, 0.5, 0.0)
 # A greatest speed below this fraction of the stated speed is a conflict.
 _LEAST_SPEED = 0.01
 # Number of speeds that the search for the greatest speed tries if other constraints conflict with the speed.
 _BISECTIONS = 8
 
 
-def initial_posture(problem: ConstrainedProblem, seed: int, rows: ProgramRows) -> tuple[ConstrainedProblem, Array]:
+def initial_posture(problem: ConstrainedProblem, seed: int) -> tuple[ConstrainedProblem, Array, ProgramRows]:
+    """Return the problem, a posture from which the search begins, and the rows of the program.
+
+    If no posture keeps clear of the surface of a strike in all its places (:class:`SpreadClearance`), the returned
+    problem requires only a share of the tilt and shift.
+
+    Raises:
+        Infeasible, SolverFailed: The same errors as in :func:`_initial_posture`.
+    """
+    *larger, last = _with_spreads(problem)
+    for tried in larger:
+        rows = ProgramRows(tried)
+        try:
+            return *_initial_posture(tried, seed, rows, beside=_QUICK), rows
+        except (Infeasible, SolverFailed):
+            continue
+    rows = ProgramRows(last)
+    return *_initial_posture(last, seed, rows), rows
+
+
+def _with_spreads(problem: ConstrainedProblem) -> Iterator[ConstrainedProblem]:
+    """Yield the problem with smaller and smaller tilts and shifts of the surface of a strike, the last without."""
+    spread = next((c for c in problem.constraints if isinstance(c, SpreadClearance)), None)
+    if spread is None or problem.surroundings is None:
+        yield problem
+        return
+    place, contact = problem.constraints.index(spread), problem.objective.contacts[0]
+    for share in _SHARES:
+        tilt, shift = (share * value for value in problem.requirements.surface_spread)
+        smaller = problem.surroundings.clearance_of_spread(contact, tilt, shift)
+        constraints, rows = list(problem.constraints), list(problem.rows)
+        constraints[place : place + 1] = [] if smaller is None else [smaller]
+        if smaller is None:
+            del rows[place : place + 1]
+        requirements = replace(problem.requirements, surface_spread=(tilt, shift))
+        yield replace(problem, requirements=requirements, constraints=tuple(constraints), rows=tuple(rows))
+
+
+def _initial_posture(
+    problem: ConstrainedProblem, seed: int, rows: ProgramRows, beside: float = 0.0
+) -> tuple[ConstrainedProblem, Array]:
     """Return the given posture moved onto the constraints, or else the first random start that reaches them.
 
     If the start still violates constraints that the projection ignores, :class:`ElasticProgram` moves the start.  The
     returned problem then has all rows that this program needed.  If no posture allows the speed of a strike, the
-    returned problem requires the greatest possible speed instead.
+    returned problem requires the greatest possible speed instead, unless ``beside`` is given
+    (:func:`find_conflicts`).
 
     Raises:
         Infeasible: No posture satisfies the constraints; the error names the conflicting constraints.
@@ -51,8 +96,10 @@ def initial_posture(problem: ConstrainedProblem, seed: int, rows: ProgramRows) -
         return problem, start
     given, problem = problem.given, problem if start is None else replace(problem, given=start)
     program = ElasticProgram(problem, rows)
-    least = find_conflicts(problem, seed, program)
-    least = _slowed(least, seed, program) if problem.requirements.strike else least
+    least = find_conflicts(problem, seed, program, beside=beside)
+    least = _slowed(least, seed, program) if problem.requirements.strike and not beside else least
+    if least.conflicts and beside:
+        raise Infeasible(least.conflicts, least.sizes)
     if least.conflicts:
         limits = f"; there {', '.join(least.at_limits[:4])}" if least.at_limits else ""
         struck = any(" / surface at " in name for name in least.conflicts)

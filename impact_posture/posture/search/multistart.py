@@ -19,7 +19,6 @@ from impact_posture.posture.program.certificate import Certificate
 from impact_posture.posture.program.compiled_solver import CompileMode
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem, equality_jacobian, rank
 from impact_posture.posture.program.ipopt import one_blas_thread
-from impact_posture.posture.program.program_rows import ProgramRows
 from impact_posture.posture.search.growing_search import GrowingSearch, Progress, SolverRun
 from impact_posture.posture.search.impact_notes import notes_on_impacts
 from impact_posture.posture.search.initial_posture import initial_objective, initial_posture
@@ -129,8 +128,7 @@ def solve(
         Infeasible: No posture satisfies the constraints; the error names the conflicting constraints.
         SolverFailed: No run ended at a certified posture.
     """
-    rows = ProgramRows(problem)
-    problem, initial = initial_posture(problem, seed, rows)
+    problem, initial, rows = initial_posture(problem, seed)
     scale = initial_objective(problem, initial)
     began = time.perf_counter()
     known, hits, screening = (initial, *guesses), [1] * (1 + len(guesses)), None

@@ -165,7 +165,7 @@ class ControllerFactory:
         key = kind, name != "path", strikes
         if key not in self._offline:
             self._offline[key] = self.offline_of(
-                self.setup, self.objective(kind), starts=self.starts, at_contact=key[1], keep_feet=strikes
+                self.setup, self.objective(kind), starts=self.starts, at_contact=key[1], strikes=strikes
             )
         return self._offline[key]
 

@@ -84,6 +84,11 @@ class Driver:
         """Expect an impact at time ``t``, s.  The nominal controller does nothing."""
 
     @property
+    def ahead(self) -> float:
+        """Time before an impact at which :meth:`expect` is called at the latest, s."""
+        return 0.0
+
+    @property
     def level(self) -> float:
         """Activation level of the preparation for an impact, 0 to 1."""
         return self.posture.level if self.compiled is None else self.compiled.library.level

@@ -54,6 +54,11 @@ class StrikeDriver(Driver):
     def expect(self, t: float) -> None:
         self._reference.expect(t)
 
+    @property
+    def ahead(self) -> float:
+        run_up = self.path.duration - (self.path.strike.run_up_s if self.path.strike else 0.0)
+        return run_up + self.setup.scenario.control.period
+
     def tick(self, reading: Reading, reference: ReferencePoint | None = None) -> Command:
         if reference is not None and reference.speed < 0:
             self._reference.back(MOVE)
