@@ -35,6 +35,11 @@ def pendulum(tmp_path_factory: pytest.TempPathFactory) -> str:
     return str(write(tmp_path_factory.mktemp("robot"), *parts))
 
 
+@pytest.fixture
+def slanted(pendulum: str) -> WorstCaseObjective:
+    return WorstCaseObjective(load_robot(pendulum), ImpactContact("tip", (1.0, 1.0, 0.0)))
+
+
 # ---- undefined quantities -----------------------------------------------------------------------------------------
 
 
@@ -56,11 +61,10 @@ def test_objective_that_exists_nowhere(pendulum: str, tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_example_notices_a_wrong_number(pendulum: str, tmp_path: Path) -> None:
+def test_example_notices_a_wrong_number(slanted: WorstCaseObjective, tmp_path: Path) -> None:
     make = need("make")
     need_compiler()
-    objective = WorstCaseObjective(load_robot(pendulum), ImpactContact("tip", (1.0, 1.0, 0.0)))
-    written = export(objective, tmp_path, prefix="pend", check=False)
+    written = export(slanted, tmp_path, prefix="pend", check=False)
     example = (tmp_path / "example.c").read_text()
     H = repr(written.manifest["self_test"]["H"])
     assert example.count(H) == 1
@@ -106,39 +110,36 @@ def test_no_compiler(small: WorstCaseObjective, tmp_path: Path, monkeypatch: pyt
         compile_and_check(tmp_path, written.prefix, [small])
 
 
-def test_compiler_that_fails(pendulum: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_compiler_that_fails(slanted: WorstCaseObjective, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     need("false")
     monkeypatch.setenv("CC", "false")
-    objective = WorstCaseObjective(load_robot(pendulum), ImpactContact("tip", (1.0, 1.0, 0.0)))
     with pytest.raises(CompilerError) as caught:
-        export(objective, tmp_path, prefix="pend")
+        export(slanted, tmp_path, prefix="pend")
     assert "exit code 1" in caught.value.line
     assert "command: false -std=c99 -O2 -ffp-contract=fast -fPIC -shared pend.c" in caught.value.line
     assert "\n" not in caught.value.line
     assert (tmp_path / "pend.c").is_file()
 
 
-def test_the_message_of_the_compiler_is_shown(pendulum: str, tmp_path: Path) -> None:
+def test_the_message_of_the_compiler_is_shown(slanted: WorstCaseObjective, tmp_path: Path) -> None:
     need_compiler()
-    objective = WorstCaseObjective(load_robot(pendulum), ImpactContact("tip", (1.0, 1.0, 0.0)))
-    export(objective, tmp_path, prefix="pend", check=False)
+    export(slanted, tmp_path, prefix="pend", check=False)
     source = tmp_path / "pend.c"
     source.write_text(source.read_text().replace("return 0;", "return nothing_of_that_name;"))
     with pytest.raises(CompilerError, match=r"pend\.c:\d+.*error.*nothing_of_that_name.*command: ") as caught:
-        compile_and_check(tmp_path, "pend", [objective])
+        compile_and_check(tmp_path, "pend", [slanted])
     assert "\n" not in caught.value.line
 
 
-def test_compiled_code_that_computes_something_else(pendulum: str, tmp_path: Path) -> None:
+def test_compiled_code_that_computes_something_else(slanted: WorstCaseObjective, tmp_path: Path) -> None:
     need_compiler()
-    objective = WorstCaseObjective(load_robot(pendulum), ImpactContact("tip", (1.0, 1.0, 0.0)))
-    export(objective, tmp_path, prefix="pend", check=False)
+    export(slanted, tmp_path, prefix="pend", check=False)
     source = tmp_path / "pend.c"
     changed = source.read_text().replace("*H = ", "*H = 1.000001 * ")
     assert changed != source.read_text()
     source.write_text(changed)
     with pytest.raises(CompilerError, match="differs from CasADi"):
-        compile_and_check(tmp_path, "pend", [objective])
+        compile_and_check(tmp_path, "pend", [slanted])
 
 
 def test_cc_may_carry_options(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -171,27 +172,25 @@ def test_bad_prefix(small: WorstCaseObjective, tmp_path: Path, prefix: str) -> N
     assert not list(tmp_path.iterdir())
 
 
-def test_never_overwrites_without_force(pendulum: str, tmp_path: Path) -> None:
-    objective = WorstCaseObjective(load_robot(pendulum), ImpactContact("tip", (1.0, 1.0, 0.0)))
+def test_never_overwrites_without_force(slanted: WorstCaseObjective, tmp_path: Path) -> None:
     (tmp_path / "README.md").write_text("mine")
     with pytest.raises(OutputError, match=r"README\.md"):
-        export(objective, tmp_path, check=False)
+        export(slanted, tmp_path, check=False)
     assert (tmp_path / "README.md").read_text() == "mine"
-    export(objective, tmp_path, check=False, force=True)
+    export(slanted, tmp_path, check=False, force=True)
     assert "written" in (tmp_path / "README.md").read_text()
 
 
-def test_bad_folder_and_posture(pendulum: str, tmp_path: Path) -> None:
-    objective = WorstCaseObjective(load_robot(pendulum), ImpactContact("tip", (1.0, 1.0, 0.0)))
+def test_bad_folder_and_posture(slanted: WorstCaseObjective, tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="no such folder"):
-        export(objective, tmp_path / "absent", check=False)
+        export(slanted, tmp_path / "absent", check=False)
     with pytest.raises(PostureError):
-        export(objective, tmp_path, posture=np.zeros(2), check=False)
+        export(slanted, tmp_path, posture=np.zeros(2), check=False)
     with pytest.raises(PostureError):
-        export(objective, tmp_path, posture=np.full(1, np.nan), check=False)
+        export(slanted, tmp_path, posture=np.full(1, np.nan), check=False)
     (tmp_path / f".written_tip.h.{os.getpid()}.part").mkdir()
     with pytest.raises(OutputError, match="cannot be written"):
-        export(objective, tmp_path, check=False)
+        export(slanted, tmp_path, check=False)
 
 
 def test_names_cannot_end_a_comment() -> None:

@@ -21,7 +21,7 @@ from impact_posture.dynamics.spatial import template
 from impact_posture.dynamics.tree import PointOnLink, Tree, Wrench
 from impact_posture.errors import UnsupportedJoint
 from impact_posture.robot.urdf import build_model
-from tests.support.helpers import NAMES, Vector, assert_close, random_configurations, rng, robot
+from tests.support.helpers import NAMES, Vector, assert_close, contact_frame, random_configurations, rng, robot
 from tests.support.pinocchio_values import central_gradient, frame_jacobian, frame_placement, mass_matrix
 from tests.support.tangent import composite_mass_matrix
 
@@ -151,8 +151,7 @@ def compare(symbolic: Symbolic, q: Vector, generator: np.random.Generator) -> No
 @functools.cache
 def symbolic_of(name: str) -> Symbolic:
     loaded = robot(name)
-    assert loaded.spec.contact.frame is not None
-    return build(loaded.model, loaded.frame_id(loaded.spec.contact.frame))
+    return build(loaded.model, loaded.frame_id(contact_frame(loaded)))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -168,8 +167,7 @@ def test_robot_agrees_with_pinocchio(name: str) -> None:
 @pytest.mark.parametrize("name", ["solo8", "panda", "kinova", "tilthex_arm"])
 def test_numeric_gradients_are_central_differences(name: str) -> None:
     loaded = robot(name)
-    assert loaded.spec.contact.frame is not None
-    model, frame = loaded.model, loaded.frame_id(loaded.spec.contact.frame)
+    model, frame = loaded.model, loaded.frame_id(contact_frame(loaded))
     generator = rng(name, "numeric")
     (q,) = random_configurations(model, 1, name, "numeric")
     left, right, w = generator.normal(size=model.nv), generator.normal(size=model.nv), generator.normal(size=6)
@@ -204,8 +202,7 @@ def test_numeric_gradients_are_central_differences(name: str) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_numeric_is_pinocchio(name: str) -> None:
     loaded = robot(name)
-    assert loaded.spec.contact.frame is not None
-    model, frame = loaded.model, loaded.frame_id(loaded.spec.contact.frame)
+    model, frame = loaded.model, loaded.frame_id(contact_frame(loaded))
     for q in random_configurations(model, 2, name, "is pinocchio"):
         numeric, point = Numeric(model).at(q), point_at(model, frame)
         assert_close(numeric.mass_matrix(), mass_matrix(model, q), TOLERANCE, "M")

@@ -18,7 +18,7 @@ from impact_posture.impact.impact_contact import ImpactContact, point_on
 from impact_posture.impact.metric import Metric
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.system.optional_package import import_mujoco
-from tests.support.helpers import Vector, assert_close, random_configurations, rng, robot, unit
+from tests.support.helpers import Vector, assert_close, contact_frame, random_configurations, rng, robot, unit
 
 FEET = ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT")
 
@@ -71,8 +71,7 @@ def test_contacts_that_do_not_feel_each_other_are_single_contacts() -> None:
 def test_one_contact_is_the_single_solution(friction: float) -> None:
     for name in ("panda", "tilthex_arm", "talos"):
         loaded = robot(name)
-        assert loaded.spec.contact.frame is not None
-        contact = ImpactContact(loaded.spec.contact.frame, (0.2, -0.4, 0.8), friction=friction)
+        contact = ImpactContact(contact_frame(loaded), (0.2, -0.4, 0.8), friction=friction)
         objective = WorstCaseObjective(loaded, contact, kind="coulomb")
         for q in random_configurations(loaded.model, 3, name, friction):
             impact, o = coulomb_impact(objective.oracle, q), objective.oracle.quantities(q)

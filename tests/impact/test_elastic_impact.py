@@ -21,7 +21,7 @@ from impact_posture.robot.joint_model import with_joint_model
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_spec import JointTransmissionSpec, TransmissionSpec
 from tests.support.arms import TIP, Y, arm, seven_joints
-from tests.support.helpers import Vector, assert_close, rng, robot, unit
+from tests.support.helpers import Vector, assert_close, contact_frame, rng, robot, unit
 from tests.support.pinocchio_values import central_gradient, frame_jacobian, frame_placement, mass_matrix
 
 STEP = 2e-4
@@ -68,8 +68,7 @@ def case_of(name: str) -> Setup:
     kind: MetricKind = ("euclidean", "kinetic", "weighted")[place % 3]
     weights = tuple(generator.uniform(0.5, 2.0, loaded.nv)) if kind == "weighted" else None
     axes: NormalFrame = ("world", "contact")[place % 2]
-    assert loaded.spec.contact.frame is not None
-    contact = ImpactContact(loaded.spec.contact.frame, tuple(unit(generator)), (0.01, -0.02, 0.03), axes)
+    contact = ImpactContact(contact_frame(loaded), tuple(unit(generator)), (0.01, -0.02, 0.03), axes)
     q = np.array(pin.integrate(loaded.model, loaded.posture(), 0.2 * generator.normal(size=loaded.nv)))
     return Setup(ImpactCase(loaded, contact, Metric(kind, weights), feet), q, stiffness)
 

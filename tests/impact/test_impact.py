@@ -22,7 +22,7 @@ from impact_posture.impact.support_compliance import default_compliance
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_spec import Support
-from tests.support.helpers import NAMES, Vector, assert_close, random_configurations, rng, robot, unit
+from tests.support.helpers import NAMES, Vector, assert_close, contact_frame, random_configurations, rng, robot, unit
 from tests.support.pinocchio_values import central_gradient, frame_jacobian, frame_placement, mass_matrix
 
 KINDS: tuple[ObjectiveKind, ...] = ("impulse", "speed", "sticking", "energy")
@@ -37,10 +37,8 @@ def supports_of(loaded: Robot) -> tuple[Support, ...]:
     """Return the robot's feet, or a point support in the kinematic chain of a robot without feet."""
     if loaded.spec.supports:
         return loaded.spec.supports
-    assert loaded.spec.contact.frame is not None
-    path = list(loaded.model.supports[loaded.model.frames[loaded.frame_id(loaded.spec.contact.frame)].parentJoint])[
-        1:
-    ]
+    joint = loaded.model.frames[loaded.frame_id(contact_frame(loaded))].parentJoint
+    path = list(loaded.model.supports[joint])[1:]
     braced = path[len(path) // 3]
     frame = next(f for f in loaded.model.frames if f.parentJoint == braced and f.type == pin.FrameType.BODY)
     return (Support(str(frame.name), "point", (0.02, 0.03, -0.01)),)
@@ -55,14 +53,13 @@ SOME = (*WHOLE, "kinova", "tiago", "talos", "anymal_kinova", "borinot", "bolt", 
 def combinations(name: str) -> Iterator[tuple[Robot, ImpactContact, Metric, tuple[Support, ...]]]:
     """Yield combinations of metric, supports and normal frame: all twelve, or three with different metrics."""
     loaded, generator = robot(name), rng(name, "combinations")
-    assert loaded.spec.contact.frame is not None
     weights = tuple(float(w) for w in generator.uniform(0.5, 2.0, loaded.nv))
     metrics = (Metric(), Metric("kinetic"), Metric("weighted", weights))
     pairs = list(itertools.product(((), supports_of(loaded)), ("world", "contact")))
     for (i, metric), (k, (supports, axes)) in itertools.product(enumerate(metrics), enumerate(pairs)):
         if name in WHOLE or k == (NAMES.index(name) + i) % 4:
             normal = unit(generator)
-            yield loaded, ImpactContact(loaded.spec.contact.frame, tuple(normal), OFFSET, axes, 3.0), metric, supports
+            yield loaded, ImpactContact(contact_frame(loaded), tuple(normal), OFFSET, axes, 3.0), metric, supports
 
 
 def describe(contact: ImpactContact, metric: Metric, supports: tuple[Support, ...]) -> str:

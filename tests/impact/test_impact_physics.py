@@ -25,6 +25,7 @@ from tests.support.helpers import (
     NAMES,
     Vector,
     assert_close,
+    contact_frame,
     random_configurations,
     relative,
     rng,
@@ -48,9 +49,7 @@ def quantities(
     compliance: float | None = None,
     frame: str | None = None,
 ) -> ImpactQuantities:
-    frame = frame or loaded.spec.contact.frame
-    assert frame is not None
-    contact = ImpactContact(frame, tuple(normal), OFFSET)
+    contact = ImpactContact(frame or contact_frame(loaded), tuple(normal), OFFSET)
     return ImpactOracle(ImpactCase(loaded, contact, metric, supports, compliance or 0.0)).quantities(q)
 
 
@@ -60,8 +59,7 @@ def feet(loaded: Robot) -> tuple[Support, ...]:
 
 def jacobians(loaded: Robot, q: Vector, supports: tuple[Support, ...]) -> tuple[Vector, Vector, Vector]:
     """Return ``M``, the 3-row contact Jacobian ``J`` and the stacked support Jacobian ``J_s`` from Pinocchio."""
-    assert loaded.spec.contact.frame is not None
-    J = frame_jacobian(loaded.model, q, loaded.frame_id(loaded.spec.contact.frame), OFFSET)[:3]
+    J = frame_jacobian(loaded.model, q, loaded.frame_id(contact_frame(loaded)), OFFSET)[:3]
     parts = [
         frame_jacobian(loaded.model, q, loaded.frame_id(s.frame), s.offset)[: s.rows] for s in supports
     ]  # fmt: skip

@@ -29,7 +29,7 @@ from impact_posture.verification.verification import verify
 from tests.support.exact import Exact, ExactImpact, digits, distance, exact, rounded
 from tests.support.exact_bounds import Bounded
 from tests.support.exported import Exported, built
-from tests.support.helpers import Vector, random_configurations, rng, robot, unit
+from tests.support.helpers import Vector, contact_frame, random_configurations, rng, robot, unit
 from tests.support.pinocchio_values import central_gradient
 from tests.support.rigid import Rigid
 from tests.support.rounding import other_rounding
@@ -61,9 +61,8 @@ def feet(loaded: Robot) -> tuple[Support, ...]:
 
 def objective(name: str, relative_compliance: float, normal: Vector | None = None) -> WorstCaseObjective:
     loaded = robot(name)
-    assert loaded.spec.contact.frame is not None
     n = unit(rng(name, "exact normal")) if normal is None else normal
-    contact = ImpactContact(loaded.spec.contact.frame, tuple(n))
+    contact = ImpactContact(contact_frame(loaded), tuple(n))
     return WorstCaseObjective(loaded, contact, supports=feet(loaded), compliance=relative_compliance / loaded.mass)
 
 

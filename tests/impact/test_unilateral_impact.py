@@ -19,7 +19,7 @@ from impact_posture.impact.friction.unilateral_impact import (
 )
 from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
-from tests.support.helpers import Vector, assert_close, robot, unit
+from tests.support.helpers import Vector, assert_close, contact_frame, robot, unit
 
 STANDING = ("solo12", "go2", "talos", "g1")
 
@@ -27,8 +27,7 @@ STANDING = ("solo12", "go2", "talos", "g1")
 def hit(name: str, normal: Vector, friction: float) -> tuple[WorstCaseObjective, Vector]:
     """Return the objective of an impact at the default contact of a standing robot, and its default posture."""
     loaded = robot(name)
-    assert loaded.spec.contact.frame is not None
-    contact = ImpactContact(loaded.spec.contact.frame, tuple(normal), friction=friction)
+    contact = ImpactContact(contact_frame(loaded), tuple(normal), friction=friction)
     return WorstCaseObjective(loaded, contact, supports=loaded.spec.supports), loaded.posture()
 
 

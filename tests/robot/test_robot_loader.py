@@ -27,7 +27,7 @@ from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.impact.quantities.impact_oracle import ImpactOracle
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.robot.urdf import example_robot_data
-from tests.support.helpers import NAMES, assert_close, random_configurations, robot
+from tests.support.helpers import NAMES, assert_close, contact_frame, random_configurations, robot
 from tests.support.pinocchio_values import mass_matrix
 
 UR5 = "example-robot-data:ur_description/urdf/ur5_robot.urdf"
@@ -286,8 +286,7 @@ def test_locking_reduces(name: str, lock: tuple[str, ...]) -> None:
     np.testing.assert_array_equal(locked.model.upperPositionLimit, np.delete(
         whole.model.upperPositionLimit, [int(whole.model.idx_qs[i]) for i in ids]
     ))  # fmt: skip
-    assert whole.spec.contact.frame is not None
-    contact = ImpactContact(whole.spec.contact.frame, (0.3, -0.5, 0.8))
+    contact = ImpactContact(contact_frame(whole), (0.3, -0.5, 0.8))
     resisting = load_robot(name, LoadOptions(armature=dict.fromkeys(lock, 1e9)))
     reduced = ImpactOracle(ImpactCase(locked, contact)).quantities(q_locked)
     expected = ImpactOracle(ImpactCase(resisting, contact)).quantities(q)

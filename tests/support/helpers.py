@@ -24,6 +24,12 @@ def robot(name: str) -> Robot:
     return load_robot(name)
 
 
+def contact_frame(loaded: Robot) -> str:
+    """Return the default contact frame of a robot."""
+    assert loaded.spec.contact.frame is not None
+    return loaded.spec.contact.frame
+
+
 @functools.cache
 def uncoupled(name: str) -> Robot:
     """Load a known robot without the couplings of its joints, for references that have no couplings."""

@@ -24,6 +24,7 @@ from impact_posture.posture.search.multistart import solve
 from impact_posture.robot.joint_model import with_joint_model
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.robot.robot_spec import Support
+from impact_posture.simulation.scenario_objective import interpreted
 from impact_posture.tsid.controller import Controller, Status
 from impact_posture.tsid.flow.reference_flow_posture import ReferenceFlowPosture
 from impact_posture.tsid.limits.acceleration_bounds import LimitLaw
@@ -268,13 +269,7 @@ def test_a_standing_robot_braces_on_its_feet() -> None:
     r = robot("solo8")
     supports = tuple(Support(s.frame, s.kind, s.offset) for s in r.spec.supports)
     value = WorstCaseObjective(r, ImpactContact("base_link", (1.0, 0.0, 0.0)), supports=supports)
-    function = value.gradient_fun()
-
-    def gradient(q: np.ndarray) -> tuple[float, np.ndarray]:
-        H, slope = function(q, value.contact.normal)
-        return float(H), np.array(slope).ravel()
-
-    posture = ImpactRobustPosture(r, gradient, K=80.0, kp=20.0, weight=0.1, base_weight=0.0)
+    posture = ImpactRobustPosture(r, interpreted(value), K=80.0, kp=20.0, weight=0.1, base_weight=0.0)
     controller = Controller(r, legged_formulation(r, posture))
     q, v = r.posture(), np.zeros(r.nv)
     controller.reset(q, v)

@@ -18,6 +18,7 @@ from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
+from impact_posture.simulation.scenario_objective import interpreted
 from impact_posture.tsid.controller import Controller, Status
 from impact_posture.tsid.point_kinematics import Point
 from impact_posture.tsid.state import State
@@ -31,7 +32,7 @@ from impact_posture.tsid.tasks.activation import Activation
 from impact_posture.tsid.tasks.frame_tasks import FramePosition
 from impact_posture.tsid.tasks.impact_robust import Gradient, ImpactRobustPosture, Spring
 from impact_posture.tsid.tasks.joint_posture import JointPosture
-from tests.support.helpers import NAMES, rng, robot
+from tests.support.helpers import NAMES, contact_frame, rng, robot
 from tests.support.step_bounds import step_bound
 from tests.support.urdfs import joint, link, write
 from tests.tsid.test_tsid_controller import DT, assert_dynamics, assert_limits, integrate, run
@@ -224,14 +225,7 @@ def test_ticks_leave_no_memory_behind() -> None:
 
 def own_gradient(r: Robot, normal: tuple[float, float, float]) -> Gradient:
     """Return the interpreted gradient of ``H`` for the default contact frame."""
-    value = WorstCaseObjective(r, ImpactContact(r.spec.contact.frame or "", normal))
-    function = value.gradient_fun()
-
-    def gradient(q: np.ndarray) -> tuple[float, np.ndarray]:
-        H, slope = function(q, value.contact.normal)
-        return float(H), np.array(slope).ravel()
-
-    return gradient
+    return interpreted(WorstCaseObjective(r, ImpactContact(contact_frame(r), normal)))
 
 
 @pytest.mark.parametrize("name", ["panda", "tiago"])
