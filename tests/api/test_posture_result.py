@@ -21,7 +21,7 @@ from impact_posture.output import plot
 from impact_posture.posture.formulation.problem_file import dump_settings, prepare, read_settings, resolved_settings
 from impact_posture.system.toolchain import find_compiler
 from tests.api.test_extension import JointDistance
-from tests.support.command import ALL_PICTURES, blank, run
+from tests.support.command import ALL_PICTURES, blank, run, succeed
 from tests.support.settings import make_settings
 
 UP = (0.0, 0.0, 1.0)
@@ -165,8 +165,7 @@ def test_a_result_saves_what_the_command_line_writes(
         monkeypatch.setitem(plot.FIGURES, name, blank)
     written = result.save(tmp_path / "python", codegen=False, report=False, jobs=1)
     options = ("--normal", 0, 0, 2, "--base", "level", "--starts", 2, "--jobs", 1, "--no-codegen", "--out", "cli")
-    done = run("optimize", "tilthex_arm", "--frame", "ee", *options, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    succeed("optimize", "tilthex_arm", "--frame", "ee", *options, cwd=tmp_path)
     theirs = tmp_path / "cli"
     assert {p.name for p in written.out.iterdir()} == {p.name for p in theirs.iterdir()}
     python, cli = (json.loads((folder / "result.json").read_text()) for folder in (written.out, theirs))

@@ -21,6 +21,7 @@ from impact_posture.robot.robot_loader import known_robots
 from impact_posture_cli import error_boundary as boundary
 from impact_posture_cli.argv import split_vectors
 from tests.support.command import run as start
+from tests.support.command import succeed
 from tests.support.helpers import relative, robot
 from tests.support.pinocchio_values import frame_jacobian, mass_matrix
 
@@ -147,8 +148,7 @@ def test_inspect_shows_joints_frames_postures_and_rotors() -> None:
 
 def test_inspect_pages_fit_the_terminal() -> None:
     for name in ("panda", "tilthex_arm", "talos"):
-        page = start("inspect", name)
-        assert page.returncode == 0
+        page = succeed("inspect", name)
         assert ("fixed to the world" in page.stdout) == (name == "panda")
         assert max(len(line) for line in page.stdout.splitlines()) <= 80
     assert "left_sole_link (surface)" in page.stdout
@@ -308,7 +308,7 @@ def test_a_package_folder_is_looked_for_where_the_user_is(tmp_path: Path) -> Non
     (tmp_path / "meshes").mkdir()
     done = start(*INSPECT, "--package-dir", "mesh", cwd=tmp_path)
     assert done.returncode == 1 and "did you mean meshes?" in done.stderr and done.stdout == ""
-    assert start(*INSPECT, "--package-dir", "meshes", cwd=tmp_path).returncode == 0
+    succeed(*INSPECT, "--package-dir", "meshes", cwd=tmp_path)
 
 
 @pytest.mark.parametrize("normal", [["0,-0.6,0.8"], ["0,", "-0.6,", "0.8"], ["[0, -0.6, 0.8]"], ["0 -0.6 0.8"]])

@@ -19,7 +19,7 @@ from cli.optimize_summary import _active
 from impact_posture.output import plot
 from impact_posture.output.plot.result_view import header_lines
 from impact_posture.output.result_reader import load_view
-from tests.support.command import ALL_PICTURES, on_terminal, read_terminal, refused, run, start
+from tests.support.command import ALL_PICTURES, on_terminal, read_terminal, refused, run, start, succeed
 
 COMMAND = Path(sys.executable).parent / "impact-posture"
 FAST = ("--starts", "2", "--jobs", "1", "--no-codegen", "--format", "png")
@@ -29,8 +29,7 @@ FAST = ("--starts", "2", "--jobs", "1", "--no-codegen", "--format", "png")
 def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a result folder of `optimize`, with figures and C code."""
     folder = tmp_path_factory.mktemp("main-job")
-    done = run("optimize", "tilthex_arm", "--frame", "ee", "--normal", 0, 0, 1, cwd=folder, pictures=ALL_PICTURES)
-    assert done.returncode == 0, done.stderr
+    succeed("optimize", "tilthex_arm", "--frame", "ee", "--normal", 0, 0, 1, cwd=folder, pictures=ALL_PICTURES)
     return folder / "tilthex_arm-ee"
 
 
@@ -79,8 +78,7 @@ def test_result_arrays_match_the_document(result: Path) -> None:
 
 
 def test_solved_again_from_its_own_problem(result: Path, tmp_path: Path) -> None:
-    done = run("optimize", result / "problem.toml", "--out", "again", "--json", *FAST[4:], cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = succeed("optimize", result / "problem.toml", "--out", "again", "--json", *FAST[4:], cwd=tmp_path)
     first = json.loads((result / "result.json").read_text())
     again = json.loads(done.stdout)
     for key in ("reduction", "redundancy", "contacts", "metric", "robot"):
@@ -90,16 +88,14 @@ def test_solved_again_from_its_own_problem(result: Path, tmp_path: Path) -> None
 
 def test_plot_draws_again(result: Path, tmp_path: Path) -> None:
     draw = ("plot", result, "--out", tmp_path / "pictures", "--format", "svg", "--figure", "ellipsoid")
-    done = run(*draw, cwd=tmp_path, pictures=("ellipsoid",))
-    assert done.returncode == 0, done.stderr
+    succeed(*draw, cwd=tmp_path, pictures=("ellipsoid",))
     assert (tmp_path / "pictures" / "ellipsoid.svg").is_file()
     refused = run("plot", tmp_path, cwd=tmp_path)
     assert refused.returncode == 1 and "result.json" in refused.stderr
 
 
 def test_verify_takes_the_problem_of_a_result(result: Path, tmp_path: Path) -> None:
-    done = run("verify", result, "--samples", 1, "--json", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = succeed("verify", result, "--samples", 1, "--json", cwd=tmp_path)
     document, known = json.loads(done.stdout), json.loads((result / "result.json").read_text())
     assert document["passed"] and document["robot"]["model_sha256"] == known["robot"]["model_sha256"]
     assert document["contacts"] == known["contacts"] and document["supports"] == known["supports"]
@@ -123,8 +119,7 @@ def test_energy_has_one_unit_in_pictures_and_tables(result: Path, tmp_path: Path
 
 def test_posture_file_starts_the_next_optimization(result: Path, tmp_path: Path) -> None:
     start_again = ("--posture", result / "posture.json", "--json", *FAST)
-    done = run("optimize", "tilthex_arm", "--normal", 0, 0, 1, *start_again, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = succeed("optimize", "tilthex_arm", "--normal", 0, 0, 1, *start_again, cwd=tmp_path)
     document = json.loads(done.stdout)
     assert document["reduction"] == pytest.approx(0.0, abs=1e-6)
     assert any("no better posture" in note for note in document["notes"])
@@ -151,8 +146,7 @@ def test_joints_that_robot_toml_holds_and_the_option_releases_are_named() -> Non
 
 
 def test_human_output_fits_80_columns(tmp_path: Path) -> None:
-    done = run("optimize", "solo8", "--normal", 1, 0, 0, *FAST, cwd=tmp_path)
-    assert done.returncode == 0
+    done = succeed("optimize", "solo8", "--normal", 1, 0, 0, *FAST, cwd=tmp_path)
     assert max(len(line.rstrip()) for line in done.stdout.splitlines()) <= 80
     for word in ("constraints", "reduction", "certificate", "base roll", "before", "after"):
         assert word in done.stdout
@@ -168,8 +162,7 @@ def test_active_constraints_are_named_in_words() -> None:
 
 
 def test_no_redundancy_is_said(tmp_path: Path) -> None:
-    done = run("optimize", "ur5", "--normal", 0, 0, 1, "--contact-pose", "full", *FAST, cwd=tmp_path)
-    assert done.returncode == 0
+    done = succeed("optimize", "ur5", "--normal", 0, 0, 1, "--contact-pose", "full", *FAST, cwd=tmp_path)
     assert "no redundancy left" in done.stdout
 
 
@@ -184,8 +177,7 @@ def test_aerial_robot_that_cannot_hover_is_warned_about(tmp_path: Path) -> None:
     (tmp_path / "robot.toml").write_text(spec)
     asked = ("optimize", "tilthex_arm.urdf", "--normal", 0, 0, 1)
     refused(run(*asked, *FAST, cwd=tmp_path), 3, "thrust of rotor_1 at rest")
-    done = run(*asked, "--no-holdable", "--json", *FAST, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = succeed(*asked, "--no-holdable", "--json", *FAST, cwd=tmp_path)
     assert any("cannot hover" in warning for warning in json.loads(done.stdout)["warnings"])
 
 
@@ -219,15 +211,13 @@ def test_knees_below_the_ground_and_a_growing_jump_are_said(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("scale", ["1e-6", "1e300"])
 def test_normal_of_any_length(scale: str, tmp_path: Path) -> None:
-    done = run("evaluate", "panda", "--normal", scale, scale, 0, "--json", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = succeed("evaluate", "panda", "--normal", scale, scale, 0, "--json", cwd=tmp_path)
     assert json.loads(done.stdout)["contacts"][0]["normal"] == pytest.approx([0.5**0.5, 0.5**0.5, 0])
 
 
 def test_failing_compiler_does_not_cost_the_posture(tmp_path: Path) -> None:
     arguments = ("optimize", "tilthex_arm", "--normal", 0, 0, 1, "--starts", 2, "--format", "png")
-    done = run(*arguments, cwd=tmp_path, env={"CC": "false"})
-    assert done.returncode == 0
+    done = succeed(*arguments, cwd=tmp_path, env={"CC": "false"})
     assert "could not be built" in done.stderr
     assert (tmp_path / "tilthex_arm-ee" / "posture.json").is_file()
     assert list((tmp_path / "tilthex_arm-ee" / "c").glob("*.c"))
@@ -299,8 +289,7 @@ def test_pictures_that_fail_after_the_answer_end_in_one_line(tmp_path: Path) -> 
 def test_what_holds_the_posture_is_told(tmp_path: Path) -> None:
     """The output lists the three most loaded actuators under each load, on the terminal and in the JSON document."""
     asked = ("optimize", "tilthex_arm", "--normal", 0, 0, 1, "--hold-force", 3, *FAST)
-    done = run(*asked, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = succeed(*asked, cwd=tmp_path)
     table = done.stdout[done.stdout.index("share of the limits") :]
     assert table.count("at rest") == table.count("while it pushes with 3 N") == 3
     document = json.loads((tmp_path / "tilthex_arm-ee" / "result.json").read_text())

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.command import refused, run
+from tests.support.command import refused, run, succeed
 from tests.support.tools import files_of
 
 COMMAND = Path(sys.executable).parent / "impact-posture"
@@ -65,7 +65,7 @@ def test_a_result_folder_is_not_a_robot_except_where_a_robot_has_its_name(tmp_pa
     for more in (("--normal", 0, 0, 1), ()):
         done = run("optimize", "out", *more, *FAST, cwd=tmp_path)
         assert done.returncode == 2 and "out/problem.toml" in done.stderr
-    assert run(*BASE, "--out", "new", "--no-report", cwd=tmp_path).returncode == 0
+    succeed(*BASE, "--out", "new", "--no-report", cwd=tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -92,9 +92,9 @@ def test_existing_output_is_kept(tmp_path: Path) -> None:
     refused(run(*BASE, "--out", "out", "--force", cwd=tmp_path), 1, written)
     assert (out / "thesis.txt").read_text() == "ten years"
     (out / "thesis.txt").unlink()
-    assert run(*BASE, "--out", "out", cwd=tmp_path).returncode == 0
+    succeed(*BASE, "--out", "out", cwd=tmp_path)
     refused(run(*BASE, "--out", "out", cwd=tmp_path), 1, "--force")
-    assert run(*BASE, "--out", "out", "--force", cwd=tmp_path).returncode == 0
+    succeed(*BASE, "--out", "out", "--force", cwd=tmp_path)
     untouched(tmp_path, "out")
 
 

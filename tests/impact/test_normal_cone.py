@@ -30,7 +30,7 @@ from impact_posture.posture.program.posture_nlp import build_nlp
 from impact_posture.posture.search.growing_search import run_start
 from impact_posture.posture.search.multistart import solve
 from impact_posture.robot.robot_loader import load_robot
-from tests.support.command import run
+from tests.support.command import run, succeed
 from tests.support.helpers import assert_close, random_configurations, relative, rng, robot, uncoupled, unit
 from tests.support.pinocchio_values import central_gradient, frame_jacobian, mass_matrix
 from tests.support.settings import make_settings
@@ -329,8 +329,7 @@ def test_export_has_the_worst_case(tmp_path: Path) -> None:
 
 def test_command_line(tmp_path: Path) -> None:
     fast = ("--starts", 2, "--jobs", 1, "--no-codegen", "--format", "png")
-    done = run("optimize", "tilthex_arm", "--normal", 0, 0, 1, "--normal-cone", 10, *fast, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = succeed("optimize", "tilthex_arm", "--normal", 0, 0, 1, "--normal-cone", 10, *fast, cwd=tmp_path)
     assert "worst normal after" in done.stdout and "10° from n" in done.stdout
     document = json.loads((tmp_path / "tilthex_arm-ee" / "result.json").read_text())
     assert document["metric"]["normal_cone_deg"] == 10

@@ -31,7 +31,7 @@ from impact_posture.output.result_reader import load_result, rewrite_report
 from impact_posture.robot.urdf import parse_urdf
 from impact_posture.simulation.series import Series, Window
 from tests.support.browser import Tab, browser
-from tests.support.command import refused, run
+from tests.support.command import refused, run, succeed
 
 HOSTILE = "</script><script>document.title='taken'</script><img src=x onerror=\"document.title='taken'\"> \u202e & é"
 
@@ -130,7 +130,7 @@ def test_commands(folder: Path, tmp_path: Path) -> None:
     opened = tmp_path / "opened"
     (tmp_path / "browse").write_text(f"#!/bin/sh\nprintf '%s' \"$1\" > '{opened}'\n")
     (tmp_path / "browse").chmod(0o755)
-    assert run("view", again, env={"BROWSER": str(tmp_path / "browse")}).returncode == 0
+    succeed("view", again, env={"BROWSER": str(tmp_path / "browse")})
     assert opened.read_text() == (again / "report.html").as_uri()
     refused(run("view", again, env={"BROWSER": "false"}), 1, "no browser could be started")
     refused(run("report", tmp_path), 1, "holds no result.json")

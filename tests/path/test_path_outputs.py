@@ -22,7 +22,7 @@ from impact_posture.posture.search.multistart import solve
 from impact_posture.robot.robot import Robot
 from tests.path.test_path import assembled
 from tests.support.arms import Z, arm
-from tests.support.command import refused, run
+from tests.support.command import refused, run, succeed
 from tests.support.helpers import robot
 from tests.support.settings import make_settings
 from tests.support.urdfs import joint, link, write
@@ -121,8 +121,7 @@ def test_files_escape_strange_names(tmp_path: Path) -> None:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     here = tmp_path_factory.mktemp("path")
     command = ("optimize", "tilthex_arm", "--normal", 0, 0, 1, "--path", "--out", "with", *FAST)
-    done = run(*command, cwd=here, pictures=["path"])
-    assert done.returncode == 0, done.stderr
+    done = succeed(*command, cwd=here, pictures=["path"])
     assert "path to the optimum by continuation: " in " ".join(done.stdout.split())
     return here / "with"
 
@@ -143,8 +142,7 @@ def test_the_command_leaves_the_path_in_its_folder(folder: Path) -> None:
 
 
 def test_the_same_problem_gives_the_same_path(folder: Path, tmp_path: Path) -> None:
-    done = run("optimize", folder / "problem.toml", "--out", "again", "--json", *FAST[2:], cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = succeed("optimize", folder / "problem.toml", "--out", "again", "--json", *FAST[2:], cwd=tmp_path)
     assert json.loads(done.stdout)["path"] == json.loads((folder / "result.json").read_text())["path"]
     assert (tmp_path / "again" / "path.csv").read_bytes() == (folder / "path.csv").read_bytes()
 
@@ -168,8 +166,7 @@ def test_a_damaged_path_is_refused(how: str, folder: Path, tmp_path: Path) -> No
 
 
 def test_plot_draws_the_path_of_a_folder(folder: Path, tmp_path: Path) -> None:
-    done = run("plot", folder, "--out", tmp_path / "again", cwd=tmp_path, pictures=["path"])
-    assert done.returncode == 0, done.stderr
+    succeed("plot", folder, "--out", tmp_path / "again", cwd=tmp_path, pictures=["path"])
     assert (tmp_path / "again" / "path.png").stat().st_size > 30_000
 
 
@@ -201,8 +198,7 @@ def crank(folder: Path) -> Path:
 
 def test_without_a_path_to_the_optimum_the_answer_is_the_posture_where_the_path_ends(tmp_path: Path) -> None:
     options = "--armature none --normal 0.6 0.8 0 --contact-pose position --path --no-collision --jobs 1 --out out"
-    done = run("optimize", crank(tmp_path), *options.split(), cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = succeed("optimize", crank(tmp_path), *options.split(), cwd=tmp_path)
     text = " ".join(done.stdout.split())
     document = json.loads((tmp_path / "out" / "result.json").read_text())
     posture = json.loads((tmp_path / "out" / "posture.json").read_text())["q"]
@@ -220,8 +216,7 @@ def test_without_a_path_to_the_optimum_the_answer_is_the_posture_where_the_path_
     share = 1 - reachable["objective"] / document["initial"]["objective"]
     assert f"reduction {100 * share:.1f}% where the path ends; the next lines are about the optimum" in text
     # The C code has the posture of posture.json, also if another command writes the code again.
-    written = run("codegen", "out", "--out", "again", cwd=tmp_path)
-    assert written.returncode == 0, written.stderr
+    succeed("codegen", "out", "--out", "again", cwd=tmp_path)
     for source in (tmp_path / "out" / "c", tmp_path / "again"):
         (code,) = (file.read_text() for file in source.glob("*.c") if "_posture[" in file.read_text())
         (numbers,) = re.findall(r"_posture\[\d+\] = \{([^}]*)\}", code)

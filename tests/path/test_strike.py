@@ -42,7 +42,7 @@ from impact_posture.robot.support_polygon import polygon_edges
 from impact_posture.system.arrays import Array
 from impact_posture_cli.optimize_summary import _path
 from impact_posture_cli.output import Page
-from tests.support.command import run
+from tests.support.command import run, succeed
 from tests.support.constraints import check_expression
 from tests.support.helpers import rng, robot
 from tests.support.settings import make_settings
@@ -433,8 +433,7 @@ def test_the_command_prints_the_strike_and_what_bounds_it(tmp_path: Path) -> Non
     command = ("optimize", robot_file, *options.split(), "--format", "png", "--strike")
     idle = run(*command, cwd=tmp_path)
     assert idle.returncode == 2 and "'--strike': does nothing without --path" in " ".join(idle.stderr.split())
-    done = run(*command, "--path", "--out", "out", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = succeed(*command, "--path", "--out", "out", cwd=tmp_path)
     text = " ".join(done.stdout.split())
     assert "then stops within" in text and "of 7 considered impacts" in text
     assert "strikes at 0.5 m/s, with 6% of the velocity limits" in text

@@ -28,7 +28,7 @@ from impact_posture.posture.search.screening import screen, screenable
 from impact_posture.posture.search.unseen_optima import SAME_VALUE, SearchEstimate, hits_by_value
 from impact_posture.system import toolchain
 from tests.posture.test_self_motion import drawn
-from tests.support.command import run
+from tests.support.command import succeed
 from tests.support.settings import make_settings
 from tests.support.tools import need_compiler
 
@@ -281,8 +281,7 @@ def test_an_optimum_of_hops_has_no_hits() -> None:
 def test_every_answer_states_the_estimate(tmp_path: Path) -> None:
     options = ("--normal", 0, 0, 1, "--jobs", 1, "--no-codegen", "--no-report", "--format", "png")
     for name, more in (("adaptive", ("--starts", 40)), ("multistart", ("--search", "multistart", "--starts", 3))):
-        done = run("optimize", "tilthex_arm", *options, *more, "--out", name, cwd=tmp_path)
-        assert done.returncode == 0, done.stderr
+        done = succeed("optimize", "tilthex_arm", *options, *more, "--out", name, cwd=tmp_path)
         block = json.loads((tmp_path / name / "result.json").read_text())["search"]
         assert block["method"] == name and block["starts"] <= 40
         assert block["line"] in " ".join(done.stdout.split())

@@ -24,7 +24,7 @@ from impact_posture.posture.manifold.feasible_start import feasible_start
 from impact_posture.posture.search.growing_search import feasible
 from impact_posture.posture.search.initial_posture import _at_speed, initial_posture
 from impact_posture.posture.search.multistart import solve
-from tests.support.command import refused, run
+from tests.support.command import refused, run, succeed
 from tests.support.constraints import check_lifted_rows
 from tests.support.helpers import Vector, rng
 from tests.support.settings import make_settings
@@ -280,13 +280,12 @@ def test_joints_that_are_too_few_are_refused(tmp_path: Path) -> None:
 
 def test_the_command(tmp_path: Path) -> None:
     words = ("optimize", "ur5", "--normal", 0, 0, 1, "--speed", 0.8, "--approach", "--starts", 2, "--no-codegen")
-    done = run(*words, "--out", "out", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = succeed(*words, "--out", "out", cwd=tmp_path)
     document = json.loads((tmp_path / "out" / "result.json").read_text())
     speed = document["optimal"]["attainable_speed"]
     assert speed >= 0.8 * (1 - 1e-6)
     assert f"{speed:.4g}  m/s" in done.stdout
     assert "approach at 0.8 m/s within the velocity limits of the joints" in document["constraints"]
-    assert run("optimize", tmp_path / "out" / "problem.toml", "--out", "again", cwd=tmp_path).returncode == 0
+    succeed("optimize", tmp_path / "out" / "problem.toml", "--out", "again", cwd=tmp_path)
     still = run("optimize", "ur5", "--normal", 0, 0, 1, "--speed", 0, "--approach", cwd=tmp_path)
     refused(still, 1, "--approach", "--speed")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import impact_posture as ip
-from tests.support.command import refused, run
+from tests.support.command import refused, run, succeed
 
 TASK = ("--normal", -1, 0, 0, "--starts", 2, "--jobs", 1, "--no-codegen", "--format", "png")
 
@@ -18,8 +18,7 @@ TASK = ("--normal", -1, 0, 0, "--starts", 2, "--jobs", 1, "--no-codegen", "--for
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The result of a contact at the front of the last link of ur5, whose side faces the surface."""
     here = tmp_path_factory.mktemp("front")
-    done = run("optimize", "ur5", *TASK, "--contact-point", "front", "--out", "front", cwd=here)
-    assert done.returncode == 0, done.stderr
+    done = succeed("optimize", "ur5", *TASK, "--contact-point", "front", "--out", "front", cwd=here)
     assert "a flat surface touches" not in done.stderr + done.stdout
     return here / "front"
 
@@ -30,8 +29,7 @@ def test_the_front_is_written_as_an_offset_and_reproduces(folder: Path, tmp_path
     assert 0.03 < np.linalg.norm(offset) < 0.06
     text = (folder / "problem.toml").read_text()
     assert f"offset = {offset}" in text and 'contact_point = "frame"' in text
-    done = run("optimize", folder / "problem.toml", "--out", "again", "--json", *TASK[6:], cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = succeed("optimize", folder / "problem.toml", "--out", "again", "--json", *TASK[6:], cwd=tmp_path)
     again = json.loads(done.stdout)
     assert again["contacts"] == document["contacts"]
     assert again["optimal"]["q"] == pytest.approx(document["optimal"]["q"], abs=1e-9)
@@ -48,8 +46,7 @@ def test_python_and_the_option_have_the_same_front(folder: Path) -> None:
 
 
 def test_a_contact_point_behind_the_front_is_said_everywhere(tmp_path: Path) -> None:
-    done = run("optimize", "ur5", *TASK, "--out", "behind", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = succeed("optimize", "ur5", *TASK, "--out", "behind", cwd=tmp_path)
     printed = " ".join((done.stdout + done.stderr).split())
     assert "a flat surface touches wrist_3_link first, " in printed
     assert " mm beyond the contact point at tool0: give --offset " in printed
@@ -58,18 +55,16 @@ def test_a_contact_point_behind_the_front_is_said_everywhere(tmp_path: Path) -> 
     (warning,) = (line for line in document["warnings"] if "a flat surface touches" in line)
     (condition,) = (c for c in document["verdict"]["conditions"] if c["key"] == "contact point")
     assert "a flat surface touches" in condition["line"] and condition["line"] in document["verdict"]["line"]
-    assert run("report", "behind", cwd=tmp_path).returncode == 0
+    succeed("report", "behind", cwd=tmp_path)
     assert "a flat surface touches" in (tmp_path / "behind" / "report.html").read_text(encoding="utf-8")
     numbers = warning.split("`offset` ")[1].split(",")[0].split()
-    mended = run("evaluate", "ur5", *TASK[:4], "--offset", *numbers, "--json", cwd=tmp_path)
-    assert mended.returncode == 0, mended.stderr
+    mended = succeed("evaluate", "ur5", *TASK[:4], "--offset", *numbers, "--json", cwd=tmp_path)
     assert not [line for line in json.loads(mended.stdout)["warnings"] if "a flat surface touches" in line]
 
 
 def test_several_contacts_keep_the_option_because_one_offset_cannot_hold_them(tmp_path: Path) -> None:
     contacts = ("--contact", "ee_link:-1,0,0", "--contact", "wrist_1_link:0,0,1")
-    done = run("evaluate", "ur5", *contacts, "--contact-point", "front", "--json", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = succeed("evaluate", "ur5", *contacts, "--contact-point", "front", "--json", cwd=tmp_path)
     document = json.loads(done.stdout)
     assert all(np.linalg.norm(contact["offset"]) > 0.01 for contact in document["contacts"])
     assert not [line for line in document["warnings"] if "a flat surface touches" in line]

@@ -19,7 +19,7 @@ from impact_posture.posture.search.global_search import GlobalSearch
 from impact_posture.posture.search.multistart import solve
 from impact_posture.posture.search.unseen_optima import estimated_optima, unseen_share
 from tests.docs.test_docs_reference import DOCS, rows
-from tests.support.command import refused, run
+from tests.support.command import refused, run, succeed
 from tests.support.settings import make_settings
 
 
@@ -63,8 +63,7 @@ def test_without_a_map_the_search_is_the_adaptive_one() -> None:
 
 def test_the_command_writes_the_map_and_the_block(tmp_path: Path) -> None:
     options = ("--search", "global", "--starts", 2, "--jobs", 1, "--no-codegen", "--out", "found")
-    done = run("optimize", "tilthex_arm", "--normal", 0, 0, 1, *options, cwd=tmp_path, pictures=("self_motion",))
-    assert done.returncode == 0, done.stderr
+    done = succeed("optimize", "tilthex_arm", "--normal", 0, 0, 1, *options, cwd=tmp_path, pictures=("self_motion",))
     found = tmp_path / "found"
     block = json.loads((found / "result.json").read_text())["global"]
     assert " ".join(block["line"].split()) in " ".join(done.stdout.split())

@@ -19,7 +19,7 @@ from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.system.libraries import build_library, library_path
 from tests.impact.test_several_contacts import HANDS
-from tests.support.command import run
+from tests.support.command import run, succeed
 from tests.support.helpers import assert_close, robot
 from tests.support.tools import need, need_compiler
 
@@ -87,8 +87,7 @@ BOTH = ("--contact", "panda_hand_tcp:0,0,1", "--contact", "panda_link4:1,0,0:2")
 
 
 def test_json(tmp_path: Path) -> None:
-    done = run("evaluate", "panda", *BOTH, "--json", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = succeed("evaluate", "panda", *BOTH, "--json", cwd=tmp_path)
     document = json.loads(done.stdout)
     assert [c["frame"] for c in document["contacts"]] == ["panda_hand_tcp", "panda_link4"]
     assert [c["impulse_bound"] for c in document["contacts"]] == [1.0, 2.0]
@@ -100,8 +99,7 @@ def test_json(tmp_path: Path) -> None:
 def test_evaluate_tells_contacts_of_one_frame_apart(tmp_path: Path) -> None:
     hand = "left_rubber_hand"
     struck = ("--contact", f"{hand}:-1,0,0", "--contact", f"{hand}:0,0,1", "--contact", "right_rubber_hand:-1,0,0:2")
-    done = run("evaluate", "g1", *struck, "--bilateral", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = succeed("evaluate", "g1", *struck, "--bilateral", cwd=tmp_path)
     lines = done.stdout.splitlines()
     assert max(map(len, lines)) <= 80
     for name in (f"{hand} (-1, 0, 0)", f"{hand} (0, 0, 1)", "right_rubber_hand"):

@@ -28,7 +28,7 @@ from impact_posture.posture.program.constrained_problem import ConstrainedProble
 from impact_posture.posture.search.multistart import PostureSolution, solve
 from impact_posture_cli.argv import put_right
 from tests.posture.test_posture import walk
-from tests.support.command import run
+from tests.support.command import run, succeed
 from tests.support.helpers import relative, rng
 from tests.support.pinocchio_values import central_gradient
 from tests.support.settings import make_settings
@@ -296,8 +296,7 @@ BASE = ("optimize", "tilthex_arm", "--normal", 0, 0, 1, "--starts", 2, "--jobs",
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     folder = tmp_path_factory.mktemp("tradeoff")
-    done = run(*BASE, "--format", "png", "--tradeoff", 6, cwd=folder, pictures=("tradeoff",))
-    assert done.returncode == 0, done.stderr
+    done = succeed(*BASE, "--format", "png", "--tradeoff", 6, cwd=folder, pictures=("tradeoff",))
     return folder / "tilthex_arm-ee", done.stdout
 
 
@@ -325,8 +324,7 @@ def test_the_folder_holds_the_curve(written: tuple[Path, str]) -> None:
 def test_the_curve_is_drawn_again_and_only_where_there_is_one(written: tuple[Path, str], tmp_path: Path) -> None:
     folder, _ = written
     arguments = ("--figure", "tradeoff", "--format", "png", "--out", tmp_path)
-    done = run("plot", folder, *arguments, cwd=tmp_path, pictures=("tradeoff",))
-    assert done.returncode == 0, done.stderr
+    succeed("plot", folder, *arguments, cwd=tmp_path, pictures=("tradeoff",))
     assert (tmp_path / "tradeoff.png").read_bytes() == (folder / "tradeoff.png").read_bytes()
     plain = tmp_path / "plain"
     shutil.copytree(folder, plain)

@@ -16,6 +16,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from importlib.metadata import entry_points
 from multiprocessing.process import BaseProcess
 from pathlib import Path
+from typing import Any
 
 import matplotlib.backends.backend_agg  # noqa: F401
 import PIL.Image
@@ -86,6 +87,13 @@ def run(
             file.seek(0)
             texts.append(file.read().decode())
     return subprocess.CompletedProcess([str(argument) for argument in arguments], child.exitcode, *texts)
+
+
+def succeed(*arguments: object, **options: Any) -> subprocess.CompletedProcess[str]:
+    """Run a command as :func:`run` does, and check that it succeeds."""
+    done = run(*arguments, **options)
+    assert done.returncode == 0, done.stderr
+    return done
 
 
 def refused(done: subprocess.CompletedProcess[str], code: int, *words: str) -> None:
