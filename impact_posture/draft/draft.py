@@ -96,7 +96,27 @@ def draft_spec(located: Located, options: LoadOptions, folder: Path) -> Draft:
         robot = _load(located, options, root, srdf)
     if root == "fixed":
         feet = ()
-    default = guess.start_posture(robot)
+    draft = _header(robot, feet)
+    draft.lines += ["", "[model]"]
+    if srdf is not None and (options.srdf or located.files.srdf is None):
+        draft.key("srdf", _path(srdf, folder), "as --srdf says" if options.srdf else "lies near the URDF")
+    draft.key("root", root, why, guessed=options.root is None and robot.mjcf is None)
+    _model(draft, robot, options, folder)
+    _postures(draft, robot)
+    carrying = _contact(draft, robot, feet, [link for link in ends if link not in legs])
+    # Two feet on legs of six or more joints are assumed to be flat.
+    flat = [len(feet) == 2 and len(guess.joints_to(robot, foot)) > 5 for foot in feet]
+    supports = [support(robot, foot, flat=level) for foot, level in zip(feet, flat, strict=True)]
+    _supports(draft, robot, supports)
+    _constraints(draft, robot, supports, carrying)
+    _limits(draft, robot)
+    _armature(draft, robot, options)
+    _propulsion(draft, robot)
+    return draft
+
+
+def _header(robot: Robot, feet: Sequence[str]) -> Draft:
+    """Return a draft with the keys above the tables."""
     draft = Draft(
         comment_lines(
             f"Data of {robot.name} that its {_file(robot, 'URDF')} cannot hold, drafted by impact-posture inspect "
@@ -110,15 +130,16 @@ def draft_spec(located: Located, options: LoadOptions, folder: Path) -> Draft:
     kind, reason = guess.likely_kind(robot, feet)
     draft.key("kind", kind, reason, guessed=True)
     if states := ", ".join(name for name in robot.postures if name != "neutral"):
+        default = guess.start_posture(robot)
         only = ", which are beyond joint limits" if default == "neutral" else ""
         chosen = f"the {_file(robot, 'SRDF')} names {states}{only}"
         draft.key("default_posture", default, chosen, guessed=True)
-    draft.lines += ["", "[model]"]
-    if srdf is not None and (options.srdf or located.files.srdf is None):
-        draft.key("srdf", _path(srdf, folder), "as --srdf says" if options.srdf else "lies near the URDF")
-    draft.key("root", root, why, guessed=options.root is None and robot.mjcf is None)
-    _model(draft, robot, options, folder)
-    if default == "neutral" and robot.joint_names:
+    return draft
+
+
+def _postures(draft: Draft, robot: Robot) -> None:
+    """Add an example of a posture if the robot has no usable posture."""
+    if guess.start_posture(robot) == "neutral" and robot.joint_names:
         base = ("base = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]",) if robot.floating else ()
         draft.note(
             "No posture has a name: optimizations start with all joints at zero or at the nearest limit, often "
@@ -127,16 +148,6 @@ def draft_spec(located: Located, options: LoadOptions, folder: Path) -> Draft:
             *base,
             f"joints = {toml(dict.fromkeys(robot.joint_names[:2], 0.5))}",
         )
-    carrying = _contact(draft, robot, feet, [link for link in ends if link not in legs])
-    # Two feet on legs of six or more joints are assumed to be flat.
-    flat = [len(feet) == 2 and len(guess.joints_to(robot, foot)) > 5 for foot in feet]
-    supports = [support(robot, foot, flat=level) for foot, level in zip(feet, flat, strict=True)]
-    _supports(draft, robot, supports)
-    _constraints(draft, robot, supports, carrying)
-    _limits(draft, robot)
-    _armature(draft, robot, options)
-    _propulsion(draft, robot)
-    return draft
 
 
 def _load(located: Located, options: LoadOptions, root: Root | None, srdf: Path | None) -> Robot:
