@@ -1,6 +1,6 @@
 """Exported C refuses hostile parameters and inputs, or gives finite numbers within the limits, under sanitizers.
 
-``--hostile-full`` tries forty times as many inputs, with more robots.
+``--hostile-full`` tries forty times as many inputs, with more robots, and inputs of libFuzzer.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from impact_posture.codegen.export import export
 from tests.hostile.arena import judging
 from tests.support.exported_controller import exported, formulation_of, impact_of
 from tests.support.struck_paths import write_references
-from tests.support.tools import need_compiler
+from tests.support.tools import need, need_compiler
 
 SUPPORT = Path(__file__).parents[1] / "support"
 # Robot, contact frame and normal of an exported controller.
@@ -31,23 +31,27 @@ METRICS = [
 ]
 
 
-def run_sanitized(folder: Path, program: str, sanitizers: str, out: Path, *words: str) -> str:
-    """Build a program of tests/support/ with all sources of an export, and return what it prints."""
-    sources = sorted(str(path) for path in folder.glob("*.c") if path.stem not in ("example", "check"))
-    flags = [
-        f"-fsanitize={sanitizers}",
-        "-fno-sanitize-recover=all",
-        "-O0",
-        "-g0",
-        f"-I{folder}",
-        f"-isystem{folder}/daqp",
+def run_sanitized(folder: Path, program: str, sanitizers: str, out: Path, *words: str, fuzz: str = "") -> str:
+    """Build a program of tests/support/ with all sources of an export, and return its complaint.
+
+    With ``fuzz``, libFuzzer calls the program with this argument, and the words are options of libFuzzer.
+    """
+    sources = [
+        str(SUPPORT / program),
+        *sorted(str(p) for p in folder.glob("*.c") if p.stem not in ("example", "check")),
     ]
-    command = [*need_compiler(), "-std=gnu99", *flags, str(SUPPORT / program), *sources, "-o", str(out / "program")]
+    compiler = need_compiler()
+    flags = [f"-fsanitize={sanitizers}", "-fno-sanitize-recover=all", "-O0", "-g0"]
+    if fuzz:
+        compiler, sources = [need("clang")], [str(SUPPORT / "fuzzer.c"), *sources]
+        flags = [f"-fsanitize=fuzzer,{sanitizers}", *flags[1:], "-Dmain=program", f'-DINPUTS="{fuzz}"']
+    flags += [f"-I{folder}", f"-isystem{folder}/daqp"]
+    command = [*compiler, "-std=gnu99", *flags, *sources, "-o", str(out / "program")]
     built = subprocess.run([*command, "-lm", "-lpthread"], capture_output=True, text=True)
-    if built.returncode and "sanit" in built.stderr + built.stdout:
-        pytest.skip(f"the compiler has no -fsanitize={sanitizers}")
+    if built.returncode and any(word in built.stderr + built.stdout for word in ("sanit", "libclang_rt")):
+        pytest.skip(f"the compiler has no {flags[0]}")
     assert built.returncode == 0, built.stderr
-    ran = subprocess.run([out / "program", *words], capture_output=True, text=True)
+    ran = subprocess.run([out / "program", *words], capture_output=True, text=True, cwd=out)
     if "unexpected memory mapping" in ran.stderr:
         pytest.skip("this kernel places memory where the thread sanitizer does not expect it")
     return "" if ran.returncode == 0 else f"{ran.returncode}: {ran.stdout} {ran.stderr[-1000:]}"
@@ -79,19 +83,44 @@ def test_inputs_of_paths(name: str, strikes: bool, tmp_path: Path, hostile_full:
         judge(name, [fault] if fault else [], calls)
 
 
+def write_metric(place: Path, name: str, frame: str, number: str) -> Path:
+    """Export a metric into a new folder, and return the folder."""
+    (place / "m").mkdir()
+    objective = impact_of(formulation_of(name)[0], frame, (1.0, 0.0, 0.0))
+    export(objective, place / "m", prefix="m", real=REALS[number], check=False)
+    return place / "m"
+
+
 @pytest.mark.parametrize(("name", "frame", "number", "threads"), METRICS)
 def test_inputs_of_metrics(
     name: str, frame: str, number: str, threads: int, tmp_path: Path, hostile_full: bool
 ) -> None:
     if threads + (number == "float") and not hostile_full:
         pytest.skip("single precision and threads: give --hostile-full")
-    objective = impact_of(formulation_of(name)[0], frame, (1.0, 0.0, 0.0))
-    (tmp_path / "m").mkdir()
-    export(objective, tmp_path / "m", prefix="m", real=REALS[number], check=False)
+    folder = write_metric(tmp_path, name, frame, number)
     sanitizers = "thread" if threads else "address,undefined,float-cast-overflow"
     inputs = 4000 if hostile_full else 100
     with judging() as judge:
-        fault = run_sanitized(
-            tmp_path / "m", "metric_inputs.c", sanitizers, tmp_path, str(inputs), str(max(1, threads))
-        )
+        fault = run_sanitized(folder, "metric_inputs.c", sanitizers, tmp_path, str(inputs), str(max(1, threads)))
         judge(name, [fault] if fault else [], inputs)
+
+
+@pytest.mark.parametrize(
+    ("program", "inputs", "runs"),
+    [("metric_inputs.c", 1, 4000), ("path_inputs.c", 100, 4000), ("controller_parameters.c", 1, 1000)],
+)
+def test_inputs_of_libfuzzer(program: str, inputs: int, runs: int, tmp_path: Path, hostile_full: bool) -> None:
+    """Try inputs that libFuzzer changes until they reach more branches of the exported code."""
+    if not hostile_full:
+        pytest.skip("inputs of libFuzzer: give --hostile-full")
+    if program == "metric_inputs.c":
+        folder = write_metric(tmp_path, *METRICS[0][:3])
+    elif program == "path_inputs.c":
+        folder = write_references(tmp_path / "path", "solo8")
+    else:
+        folder = exported("tilthex_arm", impact_of(formulation_of("tilthex_arm")[0], *CONTROLLERS["tilthex_arm"]))
+    options = (f"-runs={runs}", "-seed=1", "-max_len=1024", "-len_control=0", "-close_fd_mask=1")
+    with judging() as judge:
+        sanitizers = "address,undefined,float-cast-overflow"
+        fault = run_sanitized(folder, program, sanitizers, tmp_path, *options, fuzz=str(inputs))
+        judge(program, [fault] if fault else [], runs)

@@ -4,11 +4,11 @@
 #include <float.h>
 #include <math.h>
 #include <pthread.h>
-#include <stdint.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
+#include "hostile_numbers.h"
 #include "m.h"
 
 enum { NQ = M_NQ, NV = M_NV, FREE = NQ > NV, BATCH = 13, MOST = NV > 9 ? NV : 9, THREADS = 8 };
@@ -25,25 +25,14 @@ typedef struct {
   pthread_t thread;
 } run;
 
-static double number(run *r)
-{
-  r->seed = r->seed * 6364136223846793005u + 1442695040888963407u;
-  return (double)(r->seed >> 11) / 9007199254740992.0;
-}
-
-static int draw(run *r, int count)
-{
-  return (int)(number(r) * count);
-}
-
-static void hostile(run *r, real *x, int count)
+static void hostile(real *x, int count)
 {
   const real most = sizeof(real) == 4 ? (real)FLT_MAX : (real)DBL_MAX, least = sizeof(real) == 4 ? (real)1e-45 : (real)5e-324;
   const real absurd[] = {(real)NAN, (real)INFINITY, (real)-INFINITY, most, -most, least, -least, 0, (real)-0.0, 1, (real)1e9,
                          (real)1e18, (real)-1e30, (real)1e-30};
   int k;
-  for (k = draw(r, 3); k > 0; --k) {
-    x[draw(r, count)] = absurd[draw(r, (int)(sizeof absurd / sizeof absurd[0]))];
+  for (k = draw(3); k > 0; --k) {
+    x[draw(count)] = absurd[draw((int)(sizeof absurd / sizeof absurd[0]))];
   }
 }
 
@@ -96,15 +85,15 @@ static int abuse(run *r)
     for (k = 0; k < BATCH; ++k) {
       memset(q + k * NQ, 0, sizeof(real) * NQ);
       for (code = FREE ? 7 : 0; code < NQ; ++code) {
-        q[k * NQ + code] = (real)(number(r) - 0.5);
+        q[k * NQ + code] = (real)(number() - 0.5);
       }
       q[k * NQ + (FREE ? 6 : 0)] = 1;
       n[3 * k] = n[3 * k + 1] = 0;
       n[3 * k + 2] = 1;
-      plain[k] = number(r) < 0.3;
+      plain[k] = number() < 0.3;
       if (!plain[k]) {
-        hostile(r, q + k * NQ, NQ);
-        hostile(r, n + 3 * k, 3);
+        hostile(q + k * NQ, NQ);
+        hostile(n + 3 * k, 3);
       }
     }
     wrong = !all_finite(q, NQ) || !all_finite(n, 3);
@@ -156,6 +145,7 @@ static int abuse(run *r)
 
 static void *abused(void *r)
 {
+  seed = ((run *)r)->seed;
   ((run *)r)->failed = abuse(r);
   return NULL;
 }

@@ -2,25 +2,17 @@
  * finite velocity and acceleration.  Tests build this program with sanitizers.  Argument: number of calls.  The program
  * prints how often each phase was seen. */
 #include <math.h>
-#include <stdint.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
 #include "ctl_path.h"
-
-static uint64_t seed = 1;
-
-static double number(void)
-{
-  seed = seed * 6364136223846793005u + 1442695040888963407u;
-  return (double)(seed >> 11) / 9007199254740992.0;
-}
+#include "hostile_numbers.h"
 
 static double hostile(double value)
 {
   const double absurd[] = {NAN, INFINITY, -INFINITY, 1e308, -1e308, 1e154, 1e-308, 4.9e-324, 0.0, -0.0, 1e18, 1e-9};
-  return number() < 0.01 ? absurd[(int)(number() * 12.0)] : value;
+  return number() < 0.01 ? absurd[draw(12)] : value;
 }
 
 int main(int count, char **arguments)
@@ -30,9 +22,10 @@ int main(int count, char **arguments)
   long call, seen[CTL_PATH_HOLD + 1] = {0};
   double t = 0.0, q[CTL_NQ], v[CTL_NV];
   int i;
+  seed = 1;
   ctl_path_init(&p);
   for (call = 0; call < calls; ++call) {
-    const int kind = (int)(number() * 2000.0);
+    const int kind = draw(2000);
     double size = 0.0;
     if (kind == 0) {
       ctl_path_init(&p);
@@ -49,8 +42,8 @@ int main(int count, char **arguments)
     }
     memcpy(q, p.q, sizeof q);
     memcpy(v, p.v, sizeof v);
-    q[(int)(number() * CTL_NQ)] += hostile(0.001);
-    v[(int)(number() * CTL_NV)] += hostile(0.001);
+    q[draw(CTL_NQ)] += hostile(0.001);
+    v[draw(CTL_NV)] += hostile(0.001);
     t += 0.004 * number();
     ++seen[ctl_path_tick(&p, hostile(t), q, number() < 0.5 ? NULL : v, number() < 0.002 ? hostile(10.0) : 0.0)];
     for (i = 0; i < CTL_NQ; ++i) {
@@ -67,7 +60,7 @@ int main(int count, char **arguments)
   }
   for (i = CTL_PATH_IDLE; i <= CTL_PATH_HOLD; ++i) {
     printf("phase %d: %ld\n", i, seen[i]);
-    if (CTL_PATH_STRIKES && !seen[i]) {
+    if (CTL_PATH_STRIKES && calls >= 1000 && !seen[i]) {
       printf("the inputs do not reach this phase\n");
       return 1;
     }
