@@ -121,7 +121,9 @@ def _executor(
     if mpi:
         return executors.mpi_ranks()
     if slurm is not None:
-        return executors.SlurmJobs(out.with_name(f"{out.name}-slurm"), executors.parse_options(slurm))
+        from impact_posture.sweep.slurm_jobs import SlurmJobs, parse_options
+
+        return SlurmJobs(out.with_name(f"{out.name}-slurm"), parse_options(slurm))
     return process_pool(workers) if workers > 1 else nullcontext()
 
 

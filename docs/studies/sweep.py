@@ -29,7 +29,8 @@ from typing import Any
 import numpy as np
 
 from impact_posture.sweep.atlas import open_atlas
-from impact_posture.sweep.executors import SlurmJobs, dask_cluster
+from impact_posture.sweep.executors import dask_cluster
+from impact_posture.sweep.slurm_jobs import SlurmJobs
 from impact_posture.sweep.sweep_file import Sweep, read_sweep
 from impact_posture.sweep.sweep_run import SweepRun, run_sweep
 from impact_posture.system.processes import process_pool

@@ -1,29 +1,31 @@
-"""Executors that solve shards: local processes, a Dask cluster, MPI ranks, and Slurm jobs."""
+"""Executors that solve shards on a Dask cluster or on MPI ranks."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+import math
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future
 from contextlib import contextmanager, suppress
-from functools import cached_property
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 from impact_posture.errors import InputError
 from impact_posture.system.optional_package import import_extra
 
-# A Dask scheduler must answer within ``_LONGEST_SILENCE`` (s).  A client that disconnects tries for ``_LEAVING`` (s)
-# to inform the scheduler.
-_LONGEST_SILENCE, _LEAVING = 30, 5
+# A Dask scheduler must answer within ``_LONGEST_SILENCE`` (s).  A cluster that lost all workers must get a worker
+# within ``_WITHOUT_WORKERS`` (s).  A client that disconnects tries for ``_LEAVING`` (s) to inform the scheduler.
+_LONGEST_SILENCE, _WITHOUT_WORKERS, _LEAVING = 30, 300, 5
 
 
 class DaskWorkers(Executor):
-    """Executor of a Dask cluster, which can check that the scheduler of the cluster answers."""
+    """Executor of a Dask cluster, which can check that the cluster answers and has workers."""
 
     def __init__(self, client: Any, address: str) -> None:
         self._client, self._executor, self._address = client, client.get_executor(), address
+        # Time at which the cluster last had workers, s.  A new cluster may wait for its first worker.
+        self._last_workers = math.inf
+        self.check()
 
     def submit(self, function: Callable[..., Any], /, *arguments: Any, **named: Any) -> Future[Any]:
         """Submit one call as a task."""
@@ -31,15 +33,20 @@ class DaskWorkers(Executor):
         return future
 
     def check(self) -> None:
-        """Wait for an answer of the scheduler, because a scheduler that is stopped keeps its connections open.
+        """Ask the scheduler for its workers, because a scheduler that is stopped keeps its connections open.
 
         Raises:
-            TimeoutError: The scheduler does not answer.
+            TimeoutError: The scheduler does not answer, or its workers are lost.
         """
+        scheduler = self._client.scheduler
         try:
-            self._client.sync(self._client.scheduler.echo, data="", callback_timeout=_LONGEST_SILENCE)
-        except TimeoutError:
-            raise TimeoutError(f"{self._address} has not answered for {_LONGEST_SILENCE} s") from None
+            workers = self._client.sync(scheduler.ncores, workers=None, callback_timeout=_LONGEST_SILENCE)
+        except OSError:
+            raise TimeoutError(f"{self._address} does not answer") from None
+        if workers:
+            self._last_workers = time.monotonic()
+        elif time.monotonic() - self._last_workers > _WITHOUT_WORKERS:
+            raise TimeoutError(f"{self._address} has had no workers for {_WITHOUT_WORKERS} s")
 
 
 @contextmanager
@@ -57,7 +64,7 @@ def dask_cluster(address: str) -> Iterator[Executor]:
     except (OSError, ValueError) as error:
         what, hint = f"no Dask scheduler answers ({error})", "start a scheduler, or correct the address"
         raise InputError(what, where=f"scheduler {address}", hint=hint) from None
-    with _unlogged("distributed", "distributed.client"):
+    with _unlogged("distributed", "distributed.client", "tornado.application", "asyncio"):
         try:
             yield DaskWorkers(client, address)
         finally:
@@ -95,66 +102,3 @@ def mpi_ranks() -> Iterator[Executor]:
         raise InputError(f"MPI cannot be loaded ({error})", where="mpi", hint="install an MPI library") from None
     with MPIPoolExecutor() as pool:
         yield pool
-
-
-class SlurmJobs(Executor):
-    """Executor that submits each shard as an element of a Slurm job array, with the package submitit.
-
-    Args:
-        folder: Folder of the logs, which all nodes must be able to access.
-        options: Parameters of ``submitit.AutoExecutor``, such as ``timeout_min`` or ``slurm_partition``.
-        cluster: Cluster for submitit: ``slurm``, or ``local`` for processes of this machine; ``None`` to let submitit
-            detect the cluster.
-    """
-
-    def __init__(self, folder: Path, options: dict[str, Any], cluster: str | None = None) -> None:
-        import_extra("submitit", "slurm")
-        self._folder, self._options, self._cluster = folder, options, cluster
-        # submitit creates the folder together with the executor.  Check the options in a temporary folder, so that
-        # invalid options leave no folder.
-        with TemporaryDirectory() as trial:
-            try:
-                self._executor(Path(trial))
-            except (NameError, TypeError, ValueError, AssertionError) as error:
-                raise InputError(str(error), where="slurm", hint="give parameters of submitit.AutoExecutor") from None
-        self._waiting = ThreadPoolExecutor(1 << 10)
-
-    def _executor(self, folder: Path) -> Any:
-        import submitit
-
-        executor = submitit.AutoExecutor(folder, cluster=self._cluster)
-        executor.update_parameters(**self._options)
-        return executor
-
-    @cached_property
-    def _jobs(self) -> Any:
-        return self._executor(self._folder)
-
-    def submit(self, function: Callable[..., Any], /, *arguments: Any, **named: Any) -> Future[Any]:
-        """Submit one call as a job."""
-        return self._waiting.submit(self._jobs.submit(function, *arguments, **named).result)
-
-    def submit_all(self, calls: Sequence[tuple[Any, ...]]) -> list[Future[Any]]:
-        """Submit calls ``(function, *arguments)`` as one job array."""
-        with self._jobs.batch():
-            jobs = [self._jobs.submit(*call) for call in calls]
-        return [self._waiting.submit(job.result) for job in jobs]
-
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Stop the threads that wait for jobs (:meth:`concurrent.futures.Executor.shutdown`).  The jobs continue."""
-        self._waiting.shutdown(wait=wait, cancel_futures=cancel_futures)
-
-
-def parse_options(texts: Sequence[str]) -> dict[str, Any]:
-    """Parse texts of the form ``KEY=VALUE``.  A value that consists of decimal digits becomes an integer.
-
-    Raises:
-        InputError: An option is not of the form ``KEY=VALUE``.
-    """
-    options: dict[str, Any] = {}
-    for text in texts:
-        key, _, value = text.partition("=")
-        if not (key.isidentifier() and value):
-            raise InputError(f"'{text}' is not KEY=VALUE", where="slurm", hint="give for example timeout_min=60")
-        options[key] = int(value) if value.isdecimal() else value
-    return options

@@ -19,6 +19,7 @@ from impact_posture.output import plot
 from impact_posture.posture.formulation.problem_file import prepare
 from impact_posture.posture.search.multistart import solve
 from tests.hostile.arena import SMALL, TALLY, strike
+from tests.hostile.disturbed_sweeps import GRID
 from tests.support.settings import make_settings
 
 PAGE = Path(__file__).parents[2] / "docs" / "generated" / "hostile.md"
@@ -121,3 +122,10 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
         result = PostureResult(PostureProblem.of(prepared), solution)
         result.save(place / "out", codegen=False, report=False, jobs=1)
     return place / "out"
+
+
+@pytest.fixture
+def sweep(tmp_path: Path) -> Path:
+    pytest.importorskip("pyarrow", reason="pyarrow is not installed (the extra 'sweep')")
+    (tmp_path / "sweep.toml").write_text(GRID)
+    return tmp_path / "sweep.toml"

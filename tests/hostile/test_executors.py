@@ -11,10 +11,9 @@ import os
 import shutil
 import signal
 import socket
-import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import CancelledError, Executor, Future
 from pathlib import Path
 
@@ -25,16 +24,8 @@ from impact_posture.sweep import sweep_run
 from impact_posture.sweep.sweep_file import read_sweep
 from impact_posture.sweep.sweep_run import run_sweep
 from tests.hostile.arena import Outcome
+from tests.hostile.disturbed_sweeps import COMMAND, check, interrupted, running
 
-COMMAND = [sys.executable, str(Path(sys.executable).with_name("impact-posture"))]
-SWEEP = """shard = 3
-[problem]
-robot = "tilthex_arm"
-normal = [0, 0, 1]
-[grid]
-x = { from = -0.1, to = 0.1, count = 5 }
-z = { from = -0.1, to = 0.1, count = 6 }
-"""
 ERRORS: tuple[Callable[[], BaseException], ...] = (
     CancelledError, TimeoutError, ConnectionResetError,
     lambda: importlib.import_module("distributed.comm").CommClosedError("in <TCP>: Stream is closed"),
@@ -58,13 +49,6 @@ class Failing(Executor):
         else:
             future.set_exception(self.error)
         return future
-
-
-@pytest.fixture
-def sweep(tmp_path: Path) -> Path:
-    pytest.importorskip("pyarrow", reason="pyarrow is not installed (the extra 'sweep')")
-    (tmp_path / "sweep.toml").write_text(SWEEP)
-    return tmp_path / "sweep.toml"
 
 
 @pytest.mark.parametrize("at_submit", [False, True], ids=["result", "submit"])
@@ -95,53 +79,6 @@ def test_an_executor_that_does_not_answer(sweep: Path, tmp_path: Path, monkeypat
     monkeypatch.setattr(sweep_run, "_PAUSE", 0.01)
     with pytest.raises(WorkerDied, match=r"tcp://host has not answered for 30 s\); check them, and run the command"):
         run_sweep(read_sweep(sweep), tmp_path / "out", Stopped())
-
-
-@contextlib.contextmanager
-def running(*words: object, **more: str) -> Iterator[subprocess.Popen[bytes]]:
-    """Run a program during the block."""
-    environment = os.environ | {"OMP_NUM_THREADS": "1", **more}
-    process = subprocess.Popen(
-        list(map(str, words)), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment,
-        start_new_session=True,
-    )  # fmt: skip
-    try:
-        yield process
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-
-
-def shards(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.glob("data/*/*.parquet"))}
-
-
-def interrupted(words: list[str], out: Path, harm: Callable[[int], None], **more: str) -> Outcome:
-    """Run a sweep, and call ``harm(pid)`` after its first shard."""
-    process = subprocess.Popen(
-        [*words, "--out", str(out), "--quiet"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        start_new_session=True, env=os.environ | {"OMP_NUM_THREADS": "1", **more},
-    )  # fmt: skip
-    end = time.monotonic() + 120
-    while not list(out.rglob("*.parquet")) and process.poll() is None and time.monotonic() < end:
-        time.sleep(0.02)
-    try:
-        harm(process.pid)
-        texts = process.communicate(timeout=240)
-    finally:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-    return Outcome(tuple(words), process.returncode, *texts, ())
-
-
-def check(outcome: Outcome, sweep: Path, out: Path) -> None:
-    """Check the outcome, and that another run on this machine continues with the same bytes."""
-    assert not outcome.complaints, (outcome.complaints, outcome.err)
-    again = subprocess.run([*COMMAND, "sweep", str(sweep), "--workers", "1", "--quiet", "--out", str(out)])
-    assert again.returncode == 0
-    run_sweep(read_sweep(sweep), sweep.with_name("whole"))
-    assert shards(out) == shards(sweep.with_name("whole"))
 
 
 @pytest.mark.parametrize("victim", ["scheduler", "worker", "all workers", "stopped scheduler", "stopped, Ctrl-C"])
@@ -177,9 +114,9 @@ def test_local_jobs_are_killed(victim: str, sweep: Path, tmp_path: Path, hostile
         pytest.skip("jobs of submitit: give --hostile-full")
     pytest.importorskip("submitit")
     program = (
-        "import sys\nfrom impact_posture.sweep import executors\nfrom impact_posture_cli.main import main\n"
-        "jobs = executors.SlurmJobs\n"
-        "executors.SlurmJobs = lambda folder, options: jobs(folder, options, 'local')\nmain()\n"
+        "from impact_posture.sweep import slurm_jobs\nfrom impact_posture_cli.main import main\n"
+        "jobs = slurm_jobs.SlurmJobs\n"
+        "slurm_jobs.SlurmJobs = lambda folder, options: jobs(folder, options, 'local')\nmain()\n"
     )
 
     def harm(pid: int) -> None:

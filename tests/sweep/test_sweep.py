@@ -27,11 +27,12 @@ from impact_posture.posture.program.certificate import certify
 from impact_posture.sweep import shard
 from impact_posture.sweep.atlas import sweep_key
 from impact_posture.sweep.case_solver import CaseSolver
-from impact_posture.sweep.executors import SlurmJobs, dask_cluster, parse_options
+from impact_posture.sweep.executors import dask_cluster
 from impact_posture.sweep.maps import draw_maps
 from impact_posture.sweep.point_search import PointResult, Start
 from impact_posture.sweep.shard import solve_shard
 from impact_posture.sweep.shard_table import read_shard
+from impact_posture.sweep.slurm_jobs import SlurmJobs, parse_options
 from impact_posture.sweep.sweep_file import Axis, Grid, read_sweep
 from impact_posture.sweep.sweep_run import SweepRun, run_sweep
 from impact_posture.system.processes import process_pool
