@@ -151,6 +151,7 @@ study-scan: $(VENV)/.installed-test
 
 study-strikes: $(VENV)/.installed-test
 	$(BIN)/python -m docs.studies strikes --jobs $(JOBS) --write
+	$(BIN)/python -m docs.studies landing --jobs $(JOBS) --write
 	$(BIN)/python -m docs.studies strike-instants --jobs $(JOBS) --write
 
 study-real-impacts: $(VENV)/.installed-test

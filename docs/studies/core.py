@@ -84,6 +84,7 @@ STUDIES = {
         Study("search-catalogue", "search_quality:catalogue", "default search, catalogue; seeds", 3, page=False),
         Study("flow", "flow", "where the reference flow rests, from random starts", 1000, target="study-flow"),
         Study("strikes", "strikes", "planned strikes, other controllers; seeds", 10, target="study-strikes"),
+        Study("landing", "strikes:landing", "a fall onto four feet; seeds", 10, target="study-strikes"),
         Study("strike-instants", "strikes:instants", "early and late contacts of strikes", target="study-strikes"),
         Study("real-impacts", "real_impacts", "predicted balls, strikes and taps", target="study-real-impacts"),
         Study("points", "robustness.study:points", "runs for robustness, envelope; random draws", 40, page=False),

@@ -7,7 +7,7 @@ are stored in build/strikes.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from statistics import mean, median
@@ -38,6 +38,9 @@ CASES = (
     "ur5-strike", "panda-tap", "aerial-vertical", "aerial-lateral", "g1-strike 0.5", "g1-strike", "talos-strike 0.5"
 )  # fmt: skip
 CONTROLLERS = ("strike", "nominal", "robust-flow")
+# Falls onto several feet, and their controllers.
+FALLS = ("solo12-drop",)
+LANDING = ("strike", "posture", "nominal")
 SPREAD = Spread(speed=0.1, normal=5.0, gap=0.005)
 # Largest error of the speed, as a share of the stated speed.
 SPEED = 0.05
@@ -76,7 +79,7 @@ def struck(case: str, name: str, seed: int, offline: Callable[..., OfflinePostur
         return {"status": "no answer", "why": error.line, "plan": None, "contact": None}
     (window,), (part,), reference = record.of("impact"), document["runs"], Reference(task, setup.gap)
     # A point of the expected surface and a point of the true surface.
-    stated, true = (each.world.built.points[task.surface] for each in (set_up(scenario), setup))
+    stated, true = (each.world.built.points[task.surface] for each in (set_up(setup.scenario), setup))
     due = reference.start(0) + reference.crossing + scenario.normal @ (stated - true) / task.speed
     before = record.series.slice(reference.start(0), window.begin)
     ticks = np.logical_or(*saturated(setup, record.series))[before].sum()
@@ -93,11 +96,15 @@ def struck(case: str, name: str, seed: int, offline: Callable[..., OfflinePostur
 
 
 def results(case: str, name: str, seeds: range) -> list[dict[str, Any]]:
-    """Return the results of all seeds.  The spread does not affect the optimum, which is computed once."""
+    """Return the results of all seeds.
+
+    The spread does not affect the optimum, which is computed once, except the height of a robot that falls.
+    """
     first: list[OfflinePosture] = []
 
     def offline(*arguments: Any, **options: Any) -> OfflinePosture:
-        if not first:
+        if not first or case in FALLS:
+            first.clear()
             first.append(offline_posture(*arguments, **options))
         return first[0]
 
@@ -107,8 +114,17 @@ def results(case: str, name: str, seeds: range) -> list[dict[str, Any]]:
 
 
 def lines(request: Request) -> Iterator[str]:
-    """Yield a table for each case."""
-    pairs = [(case, name) for case in CASES if request.only in case for name in CONTROLLERS]
+    """Yield a table for each strike."""
+    return _tables(request, CASES, CONTROLLERS)
+
+
+def landing(request: Request) -> Iterator[str]:
+    """Yield a table for each fall."""
+    return _tables(request, FALLS, LANDING)
+
+
+def _tables(request: Request, cases: Sequence[str], controllers: Sequence[str]) -> Iterator[str]:
+    pairs = [(case, name) for case in cases if request.only in case for name in controllers]
     seeds = range(1, request.count + 1)
     answers = collected(lambda k: results(*pairs[k], seeds), len(pairs), request.jobs, "controllers")
     answer_of = dict(zip(pairs, answers, strict=True))
@@ -123,7 +139,7 @@ def lines(request: Request) -> Iterator[str]:
     for case in dict.fromkeys(case for case, _ in pairs):
         _, task = varied(case)
         yield from ("", f"### {case.split()[0]}, {task.speed:g} m/s", "")
-        rows = {name: answer_of[case, name] for name in CONTROLLERS}
+        rows = {name: answer_of[case, name] for name in controllers}
         base = [run["contact"]["jump"] for run in rows["nominal"] if run["contact"]]
         yield from table(HEAD, [_row(name, runs, base) for name, runs in rows.items()])
         notes = [f"- `{name}`: {note}." for name, runs in rows.items() for note in _notes(runs)]
@@ -155,12 +171,13 @@ def _notes(runs: list[dict[str, Any]]) -> Iterator[str]:
     for (status, first), count in Counter((r["status"], r["why"].split("; ")[0]) for r in runs if r["why"]).items():
         yield f"{count} of {len(runs)} runs: {status}; {first.rstrip('.')}"
     plan = runs[0]["plan"]
-    if plan is not None:
+    if plan is not None and plan["follow_through"] is not None:
         stop = plan["follow_through"]
         most = f", at most {plan['speed']:.2f} m/s, because of {plan['hindrance']}" if plan["hindrance"] else ""
         why = f" ({stop['hindrance']})" if stop["hindrance"] else ""
         length, stops = 1e3 * plan["run_up_m"], f"{stop['stopped']} of {stop['impacts']}"
-        yield f"planned run-up of {length:.0f} mm{most}; can stop after {stops} impacts{why}"
+        way = "fall from" if plan["run_up_s"] == 0 else "run-up of"
+        yield f"planned {way} {length:.0f} mm{most}; can stop after {stops} impacts{why}"
 
 
 # Scenarios in which the contact is early or late.

@@ -22,6 +22,7 @@ from impact_posture.path.strike_spaces import falls_freely, landed
 from impact_posture.path.timed_curve import TimedCurve
 from impact_posture.posture.approach.approach_speed import ApproachSpeed
 from impact_posture.posture.approach.attainable_speed import USABLE
+from impact_posture.posture.program.constrained_problem import ConstrainedProblem
 from impact_posture.posture.search.multistart import PostureSolution
 from impact_posture.system.arrays import Array
 
@@ -153,6 +154,24 @@ def posture_path(
     if motion is None:
         return _still(space, start, _NOT_SMOOTH, no_strike)
     return _finished(space, motion, connection.method, limits, failure, no_strike)
+
+
+def fall_path(problem: ConstrainedProblem, q: Array, speed: float) -> PosturePath:
+    """Return the free fall onto the contacts in the posture ``q``, shape (nq,), at a speed, m/s, without a stop.
+
+    Raises:
+        InputError: The robot does not fall, or something is in the way.
+    """
+    check_strike(problem, speed)
+    if not falls_freely(problem):
+        raise InputError(
+            "does not fall", where=problem.robot.name, hint="use a floating base without rotors and feet"
+        )
+    limits = ActuatorLimits(landed(problem, q).objective, q, problem.requirements)
+    run = run_up(problem, q, speed, limits)
+    if isinstance(run, str):
+        raise InputError(run, where="strike", hint="change the posture")
+    return _finished(run.spaces.approach, run.motion, FREE_FALL, limits, "", strike=run.strike)
 
 
 def _fault(space: PathSpace, start: Array) -> str:

@@ -35,6 +35,8 @@ _NEARNESS = 0.005
 # is the distance from the joint stops, rad (m), so that no joint rests on a stop.  The second number is the distance
 # of the center of mass from the edges of the support polygon, m, so that an impact does not tip the robot.
 _MARGINS = ((0.1, 0.05), (0.0, 0.05), (0.0, 0.025), (0.0, 0.0))
+# Distance from the joint stops of a robot that falls, rad (m), so that the impact does not straighten its legs.
+_LANDING_MARGIN = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +90,7 @@ def offline_posture(
     - If the robot ``strikes``, only the end effector touches the surface, also if the surface is tilted and shifted
       as far as ``[spread]`` of the scenario states, or by :data:`SURFACE_SPREAD` if this is more.  No foot of a
       standing robot lifts or slides during the impact.
+    - A robot that falls touches the surface with its feet, which are as far apart as in the start posture.
 
     If the search does not reach a posture with all constraints, it drops first the tilt and shift, then the demand on
     the feet, and then the constraints on collisions.  The ``note`` of the result states the dropped constraints.
@@ -99,6 +102,8 @@ def offline_posture(
     wanted, notes = scenario_requirements(setup, objective, at_contact=at_contact), dict[tuple[bool, bool], str]()
     # A robot that does not stand has no support polygon, so the second margin is zero.
     margins = dict.fromkeys((stops, edges if wanted.com_over_feet else 0.0) for stops, edges in _MARGINS)
+    if setup.scenario.falls:
+        margins = {(_LANDING_MARGIN, 0.0): None, **margins}
     if strikes:
         tilt, shift = SURFACE_SPREAD
         spread = max(tilt, setup.scenario.spread.normal), max(shift, setup.scenario.spread.gap)
@@ -110,7 +115,7 @@ def offline_posture(
         demands = replace(wanted, keep_contacts=keep, collision=collision, limit_margin=stops, com_margin=edges)
         try:
             with naming_keys(setup.scenario):
-                problem = build_problem(setup.robot, objective, setup.q, demands)
+                problem = build_problem(setup.robot, objective, setup.landed, demands)
                 solution = solve(problem, starts=starts, jobs=1, progress=_tell)
         except (Infeasible, SolverFailed) as error:
             if (keep, collision, stops, edges) == attempts[-1]:
@@ -140,11 +145,12 @@ def scenario_requirements(setup: Setup, objective: WorstCaseObjective, *, at_con
         placement = Numeric(setup.robot.model).at(setup.q).placement(point_on(setup.robot, contact.frame))
         x, y, z = (placement.translation - setup.gap * setup.scenario.normal).tolist()
         target = (x, y, z)
+    held = "position" if setup.scenario.falls else "free"
     settings = ProblemSettings(
         robot=setup.scenario.robot,
         frame=contact.frame,
         normal=contact.normal,
-        contact_pose="free" if control.end_effector is None else control.end_effector.pose,
+        contact_pose=held if control.end_effector is None else control.end_effector.pose,
         target_position=target,
         base=base,
         regularization=_NEARNESS,

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from impact_posture.dynamics.numeric import Numeric
+from impact_posture.impact.evaluation.coulomb_jump import coulomb_jumps
 from impact_posture.impact.evaluation.impact_effect import ImpactLoad, impact_effect
 from impact_posture.impact.evaluation.velocity_jump import normal_jump
 from impact_posture.impact.friction.coulomb_impact import coulomb_impact
@@ -98,7 +99,10 @@ def predict(setup: Setup, objective: WorstCaseObjective, run: Run) -> tuple[Pred
             sticking = None if here.S is None else rebound * float(np.sqrt(here.S))
             impact = coulomb_impact(objective.oracle, q)
             velocity, impulse = rebound * impact.jump, rebound * impact.mass
-            coulomb = rebound * float(np.sqrt(impact.jump @ objective.oracle.weigh(impact.jump)))
+            together = coulomb_jumps(objective, q, rebound) if scenario.falls else None
+            if together is not None:
+                velocity, impulse = together[0].velocity, sum(each.normal_impulse for each in together)
+            coulomb = float(np.sqrt(velocity @ objective.oracle.weigh(velocity)))
         expected = smooth if coulomb is None else coulomb
         effect, measured = impact_effect(setup.robot, velocity), impact_load(setup, run.series, window)
         predicted = ImpactLoad(**vars(effect), impulse=impulse, peak_force=force, jump=expected)

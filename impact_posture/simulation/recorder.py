@@ -26,7 +26,8 @@ def feet_of(setup: Setup) -> tuple[str, ...]:
     scenario, robot = setup.scenario, setup.robot
     if scenario.control.footing is None:
         return ()
-    lifted = (*scenario.control.footing.lifted, "" if scenario.contacts is None else scenario.contacts.frame)
+    struck = () if scenario.contacts is None else scenario.contacts.frames
+    lifted = (*scenario.control.footing.lifted, *struck)
     held = {point_on(robot, s.frame).joint for s in robot.spec.supports if s.frame not in lifted}
     return tuple(s.frame for s in scenario.shapes if s.frame not in lifted and point_on(robot, s.frame).joint in held)
 
@@ -38,7 +39,8 @@ class Recorder:
         self._setup, self._metric, self._world = setup, metric, setup.world
         robot, scenario = setup.robot, setup.scenario
         shapes = [s.frame for s in setup.scenario.shapes]
-        self._shape = None if scenario.push else shapes.index(scenario.task.frame)
+        struck = scenario.contacts.frames if scenario.contacts else () if scenario.push else (scenario.task.frame,)
+        self._shapes = [shapes.index(frame) for frame in struck]
         feet = feet_of(setup)
         self._feet = [k for k, frame in enumerate(shapes) if frame in feet]
         self._rows: list[tuple[Array, float, int, float]] = []
@@ -77,22 +79,22 @@ class Recorder:
 
     def first_touch(self, begin: float, end: float) -> float | None:
         """Return the time of the first touch within ``[begin, end)``, s; ``None`` if there is no touch."""
-        trace, k = self._trace(), self._shape
-        assert k is not None  # noqa: S101 (a push has no shape)
-        # During a contact, ``began`` has a new time in every tick, so only the first tick of the contact is used.
-        before = np.concatenate([[False], trace.touching[:-1, k]])
-        touches = trace.began[~before, k]
-        touches = touches[(begin <= touches) & (touches < end)]
-        return float(touches[0]) if touches.size else None
+        trace, first = self._trace(), list[float]()
+        for k in self._shapes:
+            # During a contact, ``began`` has a new time in every tick, so only the first tick of the contact is used.
+            before = np.concatenate([[False], trace.touching[:-1, k]])
+            touches = trace.began[~before, k]
+            first += touches[(begin <= touches) & (touches < end)][:1].tolist()
+        return min(first, default=None)
 
     def series(self) -> Series:
         """Return the time series of all recorded ticks."""
         trace = self._trace()
         command, level, status, distance = (np.concatenate(parts) for parts in zip(*self._columns, strict=True))
         t, q, (pushed, begin, end) = trace.t, trace.q, self._push
-        if self._shape is not None:
-            columns = trace.force, trace.peak, trace.impulse, trace.slip
-            force, peak, impulse, slip = (x[:, self._shape] for x in columns)
+        if self._shapes:
+            force, impulse = (x[:, self._shapes].sum(axis=1) for x in (trace.force, trace.impulse))
+            peak, slip = (x[:, self._shapes].max(axis=1) for x in (trace.peak, trace.slip))
         else:
             force = pushed * ((begin < t) & (t <= end + 1e-9))[:, None]
             peak, slip = np.linalg.norm(force, axis=1), trace.slip.max(axis=1, initial=0.0)

@@ -104,8 +104,8 @@ class _Loop:
             fault = "not a multiple of" if self.count <= _MOST_STEPS else f"more than {_MOST_STEPS:.0e} times"
             what = f"a tick of {self.period:g} s is {fault} the physics' {self.world.timestep:g} s"
             raise InputError(what, where=setup.scenario.source, hint="change control.period or physics.timestep")
-        command = driver.reset(setup.q)
-        self.world.reset(setup.q, seed=seed, rotor_speed=command.rotor_speed)
+        command = driver.reset(driver.start)
+        self.world.reset(driver.start, seed=seed, rotor_speed=command.rotor_speed)
         # The loop in C needs all targets before the first tick, and does not support references of the posture task.
         in_c = None if driver.leads_posture else driver.compiled
         self.compiled = compiled_world(self.world, in_c, self.count)
@@ -187,7 +187,7 @@ def _contacts(loop: _Loop, task: RepeatedContacts, mode: Mode) -> Run:
     driver, reference = loop.driver, Reference(task, loop.setup.gap)
     loop.check_length(reference.total)
     starts = [reference.start(k) for k in range(task.count)]
-    events = [(BRACE, driver.brace)]
+    events = [(0.0 if loop.setup.scenario.falls else BRACE, driver.brace)]
     if mode == "held":
         events.append((max(BRACE, starts[0] - 2 * loop.ramp), driver.hold))
     # At the start of each approach, or earlier if needed, tell the controller the expected time of the impact.

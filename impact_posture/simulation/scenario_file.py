@@ -36,6 +36,8 @@ class RepeatedContacts(StrictTable):
 
     Attributes:
         frame: Frame of the shape that touches the surface.
+        others: Frames of shapes that touch the surface at the same time.  If there are any, the robot falls freely
+            from the start, and lands on ``frame`` and ``others``.
         surface: Name of the surface.
         speed: Speed of the reference at the surface, m/s.
         acceleration: Acceleration of the reference during the approach to the surface and during the return, m/s².
@@ -57,6 +59,12 @@ class RepeatedContacts(StrictTable):
     beyond: NonNegative = 0.03
     pause: NonNegative = 1.0
     window: Positive = 0.3
+    others: tuple[str, ...] = ()
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """Frames of all shapes that touch the surface at the same time."""
+        return (self.frame, *self.others)
 
 
 @checked
@@ -157,13 +165,18 @@ class ScenarioTable(Scene, RobotSettings):
     spread: Spread = Spread()
 
     @property
+    def falls(self) -> bool:
+        """Whether the robot falls freely and lands on several contacts."""
+        return self.contacts is not None and bool(self.contacts.others)
+
+    @property
     def laws(self) -> tuple[tuple[str, tuple[float, float]], ...]:
         """Pairs (name, ``solref``) of the contact laws of the joint stops, all surfaces, and the ball."""
         return super().laws if self.throw is None else (*super().laws, ("throw", self.throw.solref))
 
     def faced(self, shape: Shape) -> Surface | None:
         """Return the surface that the point ``offset`` of a shape faces; for contacts, the surface that is hit."""
-        hit = self.contacts.surface if self.contacts is not None and self.contacts.frame == shape.frame else ""
+        hit = self.contacts.surface if self.contacts is not None and shape.frame in self.contacts.frames else ""
         return next((s for s in self.surfaces if s.name == hit), super().faced(shape))
 
     def __post_init__(self) -> None:
@@ -180,7 +193,13 @@ class ScenarioTable(Scene, RobotSettings):
             )
         (task, content), shapes = tasks.popitem(), [s.frame for s in self.shapes]
         names = [] if self.contacts is None else [("surface", self.contacts.surface, [s.name for s in self.surfaces])]
-        for key, name, known in (*names, *([] if self.push else [("frame", content.frame, shapes)])):
+        frames = {} if self.push else {"frame": [content.frame], "others": getattr(content, "others", ())}
+        names += [(key, name, shapes) for key, each in frames.items() for name in each]
+        if self.falls and (content.count, content.settle) != (1, 0):
+            raise InputError(
+                f"key '{task}.others': a robot falls once, at the start", hint="set count = 1, settle = 0"
+            )
+        for key, name, known in names:
             if name not in known:
                 table = "surfaces" if key == "surface" else "shapes"
                 hint = f"one of: {', '.join(known)}" if known else f"add it to [[{table}]]"

@@ -31,15 +31,21 @@ Gradient = Callable[[Array], tuple[float, Array]]
 def scenario_objective(setup: Setup, kind: ObjectiveKind = "impulse", *, free: bool = False) -> WorstCaseObjective:
     """Return the objective for the impact of a scenario.
 
-    With ``free``, the objective ignores the contacts at the feet of a standing robot.
+    With ``free``, the objective ignores the contacts at the feet of a standing robot.  A robot that falls has no
+    supports, and its feet are the contacts.
     """
     scenario, robot = setup.scenario, setup.robot
     x, y, z = (float(value) for value in scenario.normal)
-    contact = ImpactContact(scenario.task.frame, (x, y, z), scenario.offset, friction=scenario.friction)
+    offsets = {scenario.task.frame: scenario.offset}
+    if scenario.contacts is not None:
+        offsets |= {s.frame: s.offset for s in scenario.shapes if s.frame in scenario.contacts.others}
+    contact, *others = (
+        ImpactContact(frame, (x, y, z), offset, friction=scenario.friction) for frame, offset in offsets.items()
+    )
     footing = scenario.control.footing
-    supports = () if free or footing is None else resolve_supports(robot, None)
+    supports = () if free or footing is None or others else resolve_supports(robot, None)
     supports = tuple(s for s in supports if footing is None or s.frame not in footing.lifted)
-    return WorstCaseObjective(robot, contact, Metric(), kind, supports)
+    return WorstCaseObjective(robot, contact, Metric(), kind, supports, others=tuple(others))
 
 
 def interpreted(objective: WorstCaseObjective) -> Gradient:

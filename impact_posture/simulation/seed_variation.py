@@ -57,9 +57,11 @@ def _displaced(setup: Setup, generator: np.random.Generator) -> Setup:
     scenario, robot, n, spread = setup.scenario, setup.robot, setup.scenario.normal, setup.scenario.spread
     angle, heading, shift = generator.uniform(-1, 1, 3) * [np.deg2rad(spread.normal), np.pi, spread.gap]
     across = cone_axes(n)[:, 1:] @ [np.cos(heading), np.sin(heading)]
-    placement = Numeric(robot.model).at(setup.q).placement(point_on(robot, scenario.shape.frame, scenario.offset))
+    numeric, contacts = Numeric(robot.model).at(setup.q), scenario_objective(setup).contacts
+    middle = np.mean([numeric.placement(point_on(robot, c.frame, c.offset)).translation for c in contacts], axis=0)
     nx, ny, nz = (np.cos(angle) * n + np.sin(angle) * across).tolist()
-    x, y, z = (placement.translation - (setup.gap + shift) * n).tolist()
+    height = n @ (middle - setup.world.built.points[scenario.surface.name])
+    x, y, z = (middle - (height + shift) * n).tolist()
     displaced = replace(scenario.surface, normal=(nx, ny, nz), point=(x, y, z))
     surfaces = tuple(displaced if s == scenario.surface else s for s in scenario.surfaces)
     world = build_world(robot, replace(scenario, surfaces=surfaces), setup.q)
@@ -71,6 +73,10 @@ def _scaled(scenario: Scenario, speed: float, friction: float) -> Scenario:
     surfaces = tuple(replace(s, friction=friction * s.friction) for s in scenario.surfaces)
     scenario, task = replace(scenario, surfaces=surfaces), scenario.task
     if isinstance(task, RepeatedContacts):
+        if scenario.falls:
+            # The height of a fall increases with the square of the speed.
+            surfaces = tuple(replace(s, gap=speed**2 * s.gap) if s.name == task.surface else s for s in surfaces)
+            scenario = replace(scenario, surfaces=surfaces)
         return replace(scenario, contacts=replace(task, speed=speed * task.speed))
     if isinstance(task, SinglePush):
         x, y, z = (speed * value for value in task.force)

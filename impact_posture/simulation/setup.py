@@ -50,6 +50,13 @@ class Setup:
         return self.world.built.gaps[self.scenario.surface.name, self.scenario.shape.frame]
 
     @property
+    def landed(self) -> Array:
+        """Start posture, shape (nq,).  A robot that falls is lowered, so that its feet are on the ground."""
+        q = self.q.copy()
+        q[:3] -= self.gap * self.scenario.normal if self.scenario.falls else 0.0
+        return q
+
+    @property
     def warnings(self) -> tuple[str, ...]:
         """Warnings about the scenario that are known before a run."""
         control, lines = self.scenario.control, tuple(contact_warnings(self.world.built.mjcf, self.robot))

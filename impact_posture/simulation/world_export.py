@@ -92,6 +92,8 @@ def _task(setup: Setup, model: Any) -> Iterable[tuple[str, Iterable[float]]]:
         raise InputError(
             "a thrown ball cannot be exported", where=scenario.source, hint="use a scenario with contacts or a push"
         )
+    if scenario.falls:
+        raise InputError("a fall cannot be exported", where=scenario.source, hint="use contacts without others")
     if isinstance(task, RepeatedContacts):
         reference = Reference(task, setup.gap)
         yield "touching", [[shape.frame for shape in scenario.shapes].index(task.frame)]

@@ -15,7 +15,8 @@ from impact_posture.config.problem_settings import ObjectiveKind
 from impact_posture.controller_export.controller_structure import structure_of
 from impact_posture.errors import ControllerNotFound, ImpactPostureError, InputError
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
-from impact_posture.path.posture_path import PosturePath, check_package, posture_path
+from impact_posture.path.posture_path import PosturePath, check_package, fall_path, posture_path
+from impact_posture.posture.formulation.build_problem import build_problem
 from impact_posture.posture.program.compiled_solver import CompileMode
 from impact_posture.simulation.controllers.baselines import (
     FlowPosture,
@@ -31,9 +32,14 @@ from impact_posture.simulation.controllers.impact_baselines import (
     InvariantDriver,
     ReferenceSpreadingDriver,
 )
-from impact_posture.simulation.controllers.strike_driver import StrikeDriver
+from impact_posture.simulation.controllers.strike_driver import LandingDriver, StrikeDriver
 from impact_posture.simulation.controllers.task_formulations import nominal_posture, posture_options
-from impact_posture.simulation.offline_posture import OFFLINE_STARTS, OfflinePosture, offline_posture
+from impact_posture.simulation.offline_posture import (
+    OFFLINE_STARTS,
+    OfflinePosture,
+    offline_posture,
+    scenario_requirements,
+)
 from impact_posture.simulation.scenario_objective import Gradient, compiled, interpreted, scenario_objective
 from impact_posture.simulation.setup import Setup
 from impact_posture.system.arrays import Array
@@ -85,6 +91,8 @@ _KINDS: dict[str, ObjectiveKind] = {
 }
 # Controllers that move to an offline posture.
 _OFFLINE = ("posture", "posture-sticking", "path", "strike")
+# Controllers of a robot that falls.
+_FALLING = ("strike", "posture", "nominal")
 # Entry points by which other installed packages add controllers.
 GROUP = "impact_posture.controllers"
 
@@ -162,6 +170,9 @@ class ControllerFactory:
         # With the controller ``path``, the end effector must stay at its start, so the optimal posture differs from
         # the optimal posture of ``posture``.  The plan of a strike assumes that the feet stay in place.
         kind, strikes = _KINDS.get(name, "impulse"), name == "strike" and self.setup.scenario.contacts is not None
+        if self.setup.scenario.falls:
+            # For several contacts, only bounds on the impulses are known.
+            kind, strikes = "impulse", False
         key = kind, name != "path", strikes
         if key not in self._offline:
             self._offline[key] = self.offline_of(
@@ -197,11 +208,21 @@ class ControllerFactory:
             raise InputError(f"cannot strike: {path.reason}", where="strike", hint="change the start posture")
         return path
 
+    @cached_property
+    def landing(self) -> PosturePath:
+        """Path of the controller ``nominal`` in a fall: it lands in the start posture, without a planned stop."""
+        setup, objective = self.setup, self.objective()
+        demands = scenario_requirements(setup, objective)
+        speed = 0.0 if setup.scenario.contacts is None else setup.scenario.contacts.speed
+        return fall_path(build_problem(setup.robot, objective, setup.landed, demands), setup.landed, speed)
+
     def path_of(self, name: str) -> PosturePath | None:
         """Return the path that a controller follows; ``None`` for a controller without a path."""
         name = name.removesuffix(_STIFF)
         if name == "strike" and self.setup.scenario.contacts is not None:
             return self.strike
+        if self.setup.scenario.falls and name in _FALLING:
+            return self.landing if name == "nominal" else _without_stop(self.strike)
         return self.path if name == "path" else None
 
     def driver(self, name: str, mode: Mode = "live", gain: float | None = None) -> Driver:
@@ -234,6 +255,12 @@ class ControllerFactory:
 
     def _build(self, name: str, mode: Mode, gain: float | None) -> Driver:
         setup, robot = self.setup, self.setup.robot
+        if setup.scenario.falls:
+            path = self.path_of(name) if name in _FALLING else None
+            if path is None:
+                hint = f"choose from {', '.join(_FALLING)}"
+                raise InputError(f"'{name}' cannot control a fall", where=setup.scenario.source, hint=hint)
+            return LandingDriver(setup, nominal_posture(setup), path)
         if name == "stiff":
             return self._stiffened("nominal", "robust", gain)
         if name.endswith(_STIFF):
@@ -330,6 +357,11 @@ class ControllerFactory:
             what = f"fails: {type(error).__name__}: {error}"
             hint = "correct or uninstall the package that adds it"
             raise InputError(what, where=_from_outside(name), hint=hint) from error
+
+
+def _without_stop(path: PosturePath) -> PosturePath:
+    """Return a path with a strike without its follow-through."""
+    return replace(path, strike=path.strike and replace(path.strike, follow_through=None))
 
 
 def _from_outside(name: str) -> str:

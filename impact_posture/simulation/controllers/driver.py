@@ -34,13 +34,14 @@ class Driver:
         compiled: The same controller as machine code, which then computes the commands; ``None`` if the controller
             runs in Python.
         leads_posture: Whether the posture task has a moving reference, which each tick sends to a controller in C.
+        start: Posture at the start of a run, shape (nq,).
     """
 
     compiled: CompiledTick | None = None
     leads_posture = False
 
     def __init__(self, setup: Setup, posture: JointPosture) -> None:
-        self.setup, self.posture = setup, posture
+        self.setup, self.posture, self.start = setup, posture, setup.q
         self._end_effector = end_effector_task(setup)
         formulation = build_formulation(setup, posture, self._end_effector)
         self._body_tasks = [t for t in formulation.weighted if isinstance(t, CenterOfMass | BaseOrientation)]

@@ -1,4 +1,4 @@
-"""Controller that strikes a surface along a planned path, and then follows the planned stop."""
+"""Controllers that strike a surface along a planned path or fall onto it, and then follow the planned stop."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from impact_posture.simulation.controllers.driver import MOVE, Driver
 from impact_posture.simulation.setup import Setup
 from impact_posture.simulation.world.sensor_noise import Reading
 from impact_posture.system.arrays import Array
-from impact_posture.tsid.controller import Command
+from impact_posture.tsid.controller import Command, Controller
 from impact_posture.tsid.point_kinematics import Point
 from impact_posture.tsid.state import State
+from impact_posture.tsid.task_formulation import TaskFormulation
 from impact_posture.tsid.tasks.joint_posture import JointPosture
 
 
@@ -36,12 +37,15 @@ class StrikeDriver(Driver):
 
     def __init__(self, setup: Setup, posture: JointPosture, path: PosturePath) -> None:
         super().__init__(setup, posture)
-        point = Point(setup.scenario.task.frame, setup.scenario.offset)
-        self._state = State(setup.robot, dict.fromkeys((*self.controller.formulation.points, point)))
-        J = self._state.update(path.q[-1], None).at(point).jacobian[:3]
+        contacts, scenario = setup.scenario.contacts, setup.scenario
+        frames = () if contacts is None else contacts.frames
+        points = [Point(shape.frame, shape.offset) for shape in scenario.shapes if shape.frame in frames]
+        self._state = State(setup.robot, dict.fromkeys((*self.controller.formulation.points, *points)))
+        here = self._state.update(path.q[-1], None)
+        J = np.mean([here.at(point).jacobian[:3] for point in points], axis=0)
         rotors = setup.robot.spec.propulsion
         self.path, self._now = path, 0.0
-        self._reference = PathReference(path, -setup.scenario.normal @ J, rotors.lag if rotors else 0.0)
+        self._reference = PathReference(path, -scenario.normal @ J, rotors.lag if rotors else 0.0)
 
     def reset(self, q: Array) -> Command:
         self._reference.reset()
@@ -80,3 +84,34 @@ class StrikeDriver(Driver):
     def level(self) -> float:
         """Elapsed share of the path to the contact, 0 to 1."""
         return self._reference.level
+
+
+class LandingDriver(StrikeDriver):
+    """Controller of a robot that falls freely and lands on its feet.
+
+    In the fall, a controller without contacts holds the joints on the path.  From the contact on, the controller of
+    the standing robot follows the planned stop, or holds the posture of the contact if the path has no stop.
+    """
+
+    def __init__(self, setup: Setup, posture: JointPosture, path: PosturePath) -> None:
+        super().__init__(setup, posture, path)
+        self.start = path.q[0]
+        self._fall = Controller(setup.robot, TaskFormulation(posture=posture), period=setup.scenario.control.period)
+        self._stands = False
+
+    def reset(self, q: Array) -> Command:
+        self._stands = False
+        super().reset(q)
+        return self._fall.reset(q, np.zeros(self.setup.robot.nv))
+
+    def tick(self, reading: Reading, reference: ReferencePoint | None = None) -> Command:
+        q, v, a = self._reference.tick(reading.t, reading.q, reading.v, None)
+        self._now = reading.t
+        if self._reference.phase <= PathPhase.LATE:
+            self.posture.lead(q, v, a)
+            return self._fall.tick(reading.t, reading.q, reading.v)
+        if not self._stands:
+            self.controller.reset(reading.q, reading.v)
+            self._stands = True
+        self.controller.formulation.lead(self._state.update(q, v), a)
+        return self.controller.tick(reading.t, reading.q, reading.v)

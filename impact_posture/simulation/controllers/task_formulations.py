@@ -31,7 +31,7 @@ def end_effector_task(setup: Setup) -> EndEffector | None:
     if scenario.contacts is None and gains is not None:
         what = "has [control.end_effector], but a " + ("push" if scenario.push else "throw")
         raise SpecError(what, where=scenario.source, hint="remove [control.end_effector]")
-    if scenario.contacts is None:
+    if scenario.contacts is None or (scenario.falls and gains is None):
         return None
     if gains is None:
         what = "has contacts, but no gains for the end effector"
