@@ -13,13 +13,7 @@ from impact_posture.collision.mesh_file import UnusableShape, read_meshes
 from impact_posture.collision.mjcf_shapes import mjcf_shapes
 from impact_posture.collision.shape_corners import Corrected, shape_points
 from impact_posture.collision.shape_pairs import disabled_links, pairs_apart
-from impact_posture.collision.urdf_shapes import (
-    LinkShape,
-    LinkShapes,
-    largest_extent,
-    left_out,
-    read_urdf_shapes,
-)
+from impact_posture.collision.urdf_shapes import LinkShape, LinkShapes, largest_extent, left_out, read_urdf_shapes
 from impact_posture.errors import one_line
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array

@@ -16,13 +16,7 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.collision.mesh_file import (
-    LARGEST_FILE,
-    UnusableShape,
-    read_mesh,
-    states_y_up,
-    too_large,
-)
+from impact_posture.collision.mesh_file import LARGEST_FILE, UnusableShape, read_mesh, states_y_up, too_large
 from impact_posture.collision.shape_corners import Corrected, hull_surface, triangle_mesh
 from impact_posture.config.text_parsers import finite_numbers
 from impact_posture.errors import UrdfError, one_line

@@ -12,11 +12,7 @@ from hypothesis import strategies as st
 
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.impact.evaluation.coulomb_jump import coulomb_jump
-from impact_posture.impact.friction.unilateral_impact import (
-    StandingFeet,
-    longest_lifting_time,
-    unilateral_impact,
-)
+from impact_posture.impact.friction.unilateral_impact import StandingFeet, longest_lifting_time, unilateral_impact
 from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from tests.support.helpers import Vector, assert_close, contact_frame, robot, unit

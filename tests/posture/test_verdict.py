@@ -20,11 +20,7 @@ from impact_posture.posture.analysis.verdict import verdict
 from impact_posture.posture.analysis.verdict_changes import PredictedImpact, changes, outcome_of
 from impact_posture.posture.analysis.verdict_conditions import Circumstances
 from impact_posture.posture.approach.approach_speed import ApproachSpeed
-from impact_posture.posture.formulation.problem_file import (
-    dump_settings,
-    prepare,
-    resolved_settings,
-)
+from impact_posture.posture.formulation.problem_file import dump_settings, prepare, resolved_settings
 from impact_posture.posture.search.multistart import solve
 from impact_posture.robot.robot_spec import TransmissionSpec
 from tests.support.arms import TIP, Y, arm

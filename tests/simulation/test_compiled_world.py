@@ -19,14 +19,7 @@ from impact_posture.simulation.outcome import judge
 from impact_posture.simulation.scenario_file import read_scenario
 from impact_posture.simulation.setup import set_up
 from impact_posture.simulation.world.actuator_command import ActuatorCommand
-from tests.simulation.factories import (
-    controller_factory,
-    driven,
-    fields_of,
-    near,
-    shared_factory,
-    shortened,
-)
+from tests.simulation.factories import controller_factory, driven, fields_of, near, shared_factory, shortened
 from tests.support.daqp import sources_or_skip
 
 # Largest tolerated difference of a column, relative to its largest number.  In the scenario with a wall, the

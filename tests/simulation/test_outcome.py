@@ -20,14 +20,7 @@ from impact_posture.simulation.series import Window
 from impact_posture.simulation.setup import Setup, set_up
 from impact_posture.system.optional_package import import_mujoco
 from impact_posture.tsid.controller import Status
-from tests.simulation.factories import (
-    SHIPPED,
-    by_hand,
-    controller_factory,
-    driven,
-    shared_setup,
-    shortened,
-)
+from tests.simulation.factories import SHIPPED, by_hand, controller_factory, driven, shared_setup, shortened
 
 RELAXED, HELD = STATUSES.index(Status.RELAXED), STATUSES.index(Status.INFEASIBLE)
 HEXTILT = Path(__file__).parent / "hextilt.toml"

@@ -14,13 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from impact_posture.errors import (
-    ControllerNotFound,
-    ImpactPostureError,
-    InputError,
-    SimulationDiverged,
-    WorkerDied,
-)
+from impact_posture.errors import ControllerNotFound, ImpactPostureError, InputError, SimulationDiverged, WorkerDied
 from impact_posture.system.processes import end_early, fork_call, fork_map, signals_held, undone
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="needs /proc to look at processes")

@@ -18,12 +18,7 @@ import numpy as np
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import Tree
 from impact_posture.errors import MetricError
-from impact_posture.impact.friction.coulomb_impact import (
-    NO_FRICTION,
-    CoulombImpact,
-    coulomb_impact,
-    impact_gradients,
-)
+from impact_posture.impact.friction.coulomb_impact import NO_FRICTION, CoulombImpact, coulomb_impact, impact_gradients
 from impact_posture.impact.quantities.lifted_form import Guess
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.posture.constraints.constraint import Constraint, LiftedRows, Linearization, digest
