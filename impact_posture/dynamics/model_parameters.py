@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from impact_posture.dynamics.repeated_limbs import RepeatedLimbs
 from impact_posture.dynamics.spatial import constant, rounded
-from impact_posture.robot.model_joints import finite_armature
+from impact_posture.robot.model_joints import finite_armature, v_slice
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 
@@ -61,5 +61,5 @@ def _numbers(model: pin.Model) -> dict[tuple[int, str], Array]:
     armature, numbers = finite_armature(model)[0], dict[tuple[int, str], Array]()
     for joint in range(1, model.njoints):
         numbers[joint, "translation"] = rounded(model.jointPlacements[joint].translation)
-        numbers[joint, "armature"] = rounded(armature[model.idx_vs[joint] : model.idx_vs[joint] + model.nvs[joint]])
+        numbers[joint, "armature"] = rounded(armature[v_slice(model, joint)])
     return numbers

@@ -217,7 +217,11 @@ class Robot:
     @property
     def held_entries(self) -> list[int]:
         """Entries of the joints :attr:`held` in ν."""
-        return [k for joint in self.held for k in range(self.nv)[v_slice(self.model, self.joint_id(joint))]]
+        return self.entries(self.held)
+
+    def entries(self, joints: Sequence[str]) -> list[int]:
+        """Return the entries of joints in ν; raise the errors of :meth:`joint_id`."""
+        return [k for joint in joints for k in range(self.nv)[v_slice(self.model, self.joint_id(joint))]]
 
     def fixed_with(self, hold: Sequence[str]) -> tuple[str, ...]:
         """Return ``hold``, the joints with equal position limits, and all joints that are coupled to them."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from impact_posture.robot.model_joints import q_slice, v_slice
 from impact_posture.robot.robot import Robot
 
 
@@ -23,8 +24,7 @@ class JointRanges:
         self.velocity, self.index = robot.velocity_limits, np.zeros(robot.nv, dtype=np.intp)
         for name in robot.joint_names:
             joint = model.getJointId(name)
-            v = slice(model.idx_vs[joint], model.idx_vs[joint] + model.nvs[joint])
+            q, v = q_slice(model, joint), v_slice(model, joint)
             if model.nqs[joint] == model.nvs[joint]:
-                q = np.arange(model.idx_qs[joint], model.idx_qs[joint] + model.nqs[joint])
-                self.index[v] = q
+                self.index[v] = np.arange(q.start, q.stop)
                 self.lower[v], self.upper[v] = model.lowerPositionLimit[q], model.upperPositionLimit[q]

@@ -9,6 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.config.checked import checked
+from impact_posture.robot.model_joints import v_slice
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 
@@ -72,7 +73,7 @@ class PointKinematics:
         mask = np.zeros((count, nv))
         for k, frame in enumerate(frames):
             for joint in model.supports[frame.parentJoint]:
-                mask[k, model.idx_vs[joint] : model.idx_vs[joint] + model.nvs[joint]] = 1.0
+                mask[k, v_slice(model, joint)] = 1.0
         self._mask, self._rows_mask = mask, np.repeat(mask, 6, axis=0)
         self._position, rotation = np.zeros((count, 3)), np.zeros((count, 3, 3))
         # Views on the same memory, in the shapes that the matrix products require.

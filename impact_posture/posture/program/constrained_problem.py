@@ -139,8 +139,4 @@ def equality_jacobian(problem: ConstrainedProblem, numeric: Numeric) -> Array:
 
 def held_rows(robot: Robot, hold: Sequence[str]) -> Array:
     """Return a unit row for each tangent entry of a held joint, shape (k, nv)."""
-    rows: list[int] = []
-    for joint in hold:
-        index = robot.joint_id(joint)
-        rows += range(robot.model.idx_vs[index], robot.model.idx_vs[index] + robot.model.nvs[index])
-    return np.eye(robot.nv)[rows]
+    return np.eye(robot.nv)[robot.entries(hold)]
