@@ -108,7 +108,7 @@ class SlurmJobs(Executor):
     def _cancel(self) -> None:
         # Local jobs, which print an error if they are cancelled, end by themselves.
         if self._open and self._jobs.cluster == "slurm":
-            _ask(_LEAVING, "scancel", *{job.job_id.partition("_")[0] for job in self._open.values()})
+            _ask(_LEAVING, "scancel", *{job.job_id.partition("_")[0] for job in list(self._open.values())})
 
     def _watch(self) -> None:
         """Pass results and errors of the jobs on until :meth:`shutdown`."""
