@@ -149,7 +149,7 @@ def read_urdf_shapes(robot: Robot, first: str = "collision") -> LinkShapes:
         return read
     root = parse_urdf(files.urdf)
     colors = {tag.get("name", ""): tag for tag in root.findall("material")}
-    for link in root.iter("link"):
+    for link in root.findall("link"):
         name = link.get("name", "")
         if not robot.model.existFrame(name, pin.FrameType.BODY):
             raise UrdfError("has changed since the robot was loaded", where=str(files.urdf), hint="load it again")

@@ -34,7 +34,7 @@ def check_inertias(root: ET.Element, model: pin.Model, path: Path, accept: bool)
         InertiaError: A mass is negative, a link without mass has moments, or moments break the triangle inequality.
     """
     where, warnings = str(path), []
-    for link in root.iter("link"):
+    for link in root.findall("link"):
         fault = _link_fault(link, where)
         if fault is None:
             continue

@@ -151,7 +151,7 @@ def _check_depth(root: ET.Element, path: Path) -> None:
 
 def _check_origins(root: ET.Element, path: Path) -> None:
     """Raise an error if the origin of a joint, mass or shape is farther away than :data:`FARTHEST`."""
-    for owner in (*root.iter("link"), *root.iter("joint")):
+    for owner in (*root.findall("link"), *root.findall("joint")):
         for origin in owner.iter("origin"):
             xyz = origin.get("xyz", "")
             if any(abs(number) > FARTHEST for number in finite_numbers(xyz, 3)):
@@ -181,6 +181,8 @@ def _read(path: Path) -> tuple[str, ET.Element]:
         raise UrdfError.unreadable(path, error) from None
     except (expat.ExpatError, ValueError) as error:  # Path raises ValueError for a name with a null character.
         raise UrdfError(f"is not XML ({error})", where=str(path), hint="give a URDF file") from None
+    if root.tag in ("mujoco", "mujocoinclude"):
+        raise UrdfError("is an MJCF that MuJoCo cannot read", where=str(path), hint="save it as UTF-8")
     if root.tag != "robot":
         fault = f"is XML but not a URDF: its root is <{root.tag}>, not <robot>"
         raise UrdfError(fault, where=str(path), hint="expand xacro first, or give the .urdf")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import time
 import zipfile
@@ -61,6 +62,20 @@ def test_an_mjcf_in_utf_16(arena: Path) -> None:
     outcome = strike(arena, "inspect", "bad.xml")
     assert (outcome.code, outcome.complaints) == (1, []), outcome.err
     assert "bad.xml: is in UTF-16" in outcome.err
+    (arena / "bad.xml").write_bytes(ARM.encode("utf-16-le"))
+    outcome = strike(arena, "inspect", "bad.xml")
+    assert (outcome.code, outcome.complaints) == (1, []), outcome.err
+    assert "bad.xml: is an MJCF that MuJoCo cannot read; save it as UTF-8" in outcome.err
+
+
+def test_links_and_joints_of_gazebo_plugins_are_no_links_and_joints(arena: Path) -> None:
+    """The plugins in published URDFs name links and joints by elements of these names."""
+    plugin = "<gazebo><plugin><link>base</link><joint>elbow</joint><link name='other'><origin xyz='1e9 0 0'/></link>"
+    (arena / "own.urdf").write_text(SMALL.replace("</robot>", f"{plugin}</plugin></gazebo></robot>"))
+    (arena / "plain.urdf").write_text(SMALL)
+    own, plain = (strike(arena, "evaluate", name, "--json", *PUSH) for name in ("own.urdf", "plain.urdf"))
+    assert (own.code, own.complaints) == (0, []), own.err
+    assert json.loads(own.out)["evaluation"] == json.loads(plain.out)["evaluation"]
 
 
 @pytest.mark.parametrize("tag", ["disable_collisions", "rotor_params", "group_state"])

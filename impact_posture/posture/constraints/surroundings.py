@@ -218,6 +218,12 @@ class Surroundings:
             fixed._walls.append(_Wall(still, wall.exempt))
         return fixed
 
+    @property
+    def by_design(self) -> str:
+        """Hint for a pair of links that may touch."""
+        tag = "<disable_collisions> in an SRDF" if self.robot.mjcf is None else "<exclude> in the MJCF"
+        return f"links that touch by design may touch by {tag}"
+
     def closest(self, q: Array) -> dict[str, object]:
         """Return the closest bodies at ``q`` and their distance, m."""
         numeric = self._moving.at(q)

@@ -111,10 +111,9 @@ def _initial_posture(
             hint += (
                 "; check the sign of the normal, which points towards the robot, and how far the `surface` reaches"
             )
-        if overlap:
-            tag = "<disable_collisions> in an SRDF" if problem.robot.mjcf is None else "<exclude> in the MJCF"
-            hint += f"; links that touch by design may touch by {tag}"
-            if problem.surroundings and not problem.surroundings.collisions(least.q):
+        if overlap and problem.surroundings:
+            hint += f"; {problem.surroundings.by_design}"
+            if not problem.surroundings.collisions(least.q):
                 hint += " (there only the hulls around the links touch, not the links)"
         raise Infeasible(least.conflicts, least.sizes, hint=hint + limits)
     projection = Projector(problem).project(least.q)

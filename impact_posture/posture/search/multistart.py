@@ -148,7 +148,8 @@ def solve(
     good, touching = _without_collisions(problem, certified)
     if not good:
         fault = f"original shapes touch at all {len(certified)} certified postures: {touching}"
-        hint = "try more `starts`, another `posture`, or a larger `clearance`"
+        design = problem.surroundings.by_design if problem.surroundings else ""
+        hint = f"try more `starts`, another `posture`, or a larger `clearance`; {design}"
         raise SolverFailed(fault, where="solver", hint=hint)
     # Among equally good runs, take the first in the order of starts, so that the solution does not depend on timing.
     best = min(good, key=lambda r: round(r.minimized, _DIGITS))
