@@ -109,9 +109,11 @@ def shortened(space: PathSpace, postures: Sequence[Array], seed: int = 0) -> lis
         if space.length(path) < straight * (1 + _DETOUR):
             break
         i, j = sorted(rng.choice(len(path), 2, replace=False))
-        between = space.walk(path[i], path[j]) if j - i > 1 else []
-        if between and between[-1] is path[j] and space.length(between) < space.length(path[i : j + 1]):
-            path = [*path[:i], *between, *path[j + 1 :]]
+        length = space.length(path[i : j + 1])
+        if space.distance(path[i], path[j]) * (1 + _BENT) < length:
+            between = space.walk(path[i], path[j], length)
+            if between[-1] is path[j] and space.length(between) < length:
+                path = [*path[:i], *between, *path[j + 1 :]]
     if space.length(path) < straight * (1 + _BENT):
         return path
     band = path

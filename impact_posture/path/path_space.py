@@ -140,13 +140,14 @@ class PathSpace:
             return None
         return moved if self.clear(q, moved) else None
 
-    def walk(self, start: Array, target: Array) -> list[Array]:
+    def walk(self, start: Array, target: Array, longest: float = np.inf) -> list[Array]:
         """Return postures from ``start`` towards ``target`` along the constraints, until no step comes nearer.
 
         The last posture is ``target`` itself if the walk reaches it.  Inequalities deflect the steps, because the
-        postures are pulled onto them, too.
+        postures are pulled onto them, too.  The walk also ends where it is longer than ``longest`` with the rest of
+        the way, as a tangent length.
         """
-        path = [start]
+        path, walked = [start], 0.0
         while True:
             left = self.difference(path[-1], target)
             size = float(np.linalg.norm(left))
@@ -154,9 +155,10 @@ class PathSpace:
                 if self.clear(path[-1], target):
                     path.append(target)
                 return path
-            moved = self.take(path[-1], left * (STEP / size))
+            moved = self.take(path[-1], left * (STEP / size)) if walked + size < longest else None
             if moved is None or self.distance(moved, target) > size - _PROGRESS * STEP:
                 return path
+            walked += self.distance(path[-1], moved)
             path.append(moved)
 
     def unwound(self, start: Array, target: Array) -> Array:

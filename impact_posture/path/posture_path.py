@@ -218,21 +218,28 @@ def _struck(
     # The program requires the greatest possible speed if no posture allows the stated speed.
     constraints = solution.problem.constraints if solution.problem.requirements.strike else ()
     required = min([speed, *(c.speed for c in constraints if isinstance(c, ApproachSpeed))])
-    best: tuple[int, RunUp, str] | None = None
-    failure = ""
+    failure, slower, best = "", list[tuple[int, RunUp]](), None
     for k, target in _targets(solution, space):
         run = run_up(solution.problem, target, required, limits)
-        if not isinstance(run, str) and best and run.strike.speed < _FASTER * best[1].strike.speed:
-            continue
-        led = run if isinstance(run, str) else _led(solution.initial, run, limits, seed, effort)
-        if isinstance(led, str):
+        if isinstance(run, str):
+            failure = failure or run
+        elif run.strike.hindrance:
+            struck = run.strike
+            slow = f"the optimum allows a strike at {struck.speed:.3g} m/s at most, because of {struck.hindrance}"
+            failure = failure or slow
+            slower.append((k, run))
+        else:
+            led = _led(solution.initial, run, limits, seed, effort)
+            if not isinstance(led, str):
+                best = k, *led
+                break
             failure = failure or led
-            continue
-        best, struck = (k, *led), led[0].strike
-        if not struck.hindrance:
-            break
-        slow = f"the optimum allows a strike at {struck.speed:.3g} m/s at most, because of {struck.hindrance}"
-        failure = failure or slow
+    # The way to a run-up takes longer to compute than the run-up, so slower strikes get a way only now.
+    while slower and best is None:
+        enough = max(run.strike.speed for _, run in slower) / _FASTER
+        k, run = slower.pop(next(i for i, (_, run) in enumerate(slower) if run.strike.speed >= enough))
+        led = _led(solution.initial, run, limits, seed, effort)
+        best = None if isinstance(led, str) else (k, *led)
     if best is None:
         return failure or "no optimum allows a strike"
     k, run, method = best
