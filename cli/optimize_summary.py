@@ -87,17 +87,35 @@ def summarize(page: Page, prepared: Prepared, solution: PostureSolution, documen
         page.line(note)
     if document["active"]:
         page.line("active: " + ", ".join(dict.fromkeys(_active(a) for a in document["active"])))
+    _certificate(page, solution, document.get("collision"))
+    _solves(page, solution)
+    page.line(document["search"]["line"])
+    if "global" in document:
+        page.line(document["global"]["line"])
+    if "tradeoff" in document:
+        _tradeoff(page, document, [n for n in document["notes"] if n.startswith("trade-off:")])
+    if "path" in document:
+        _path(page, document["path"])
+    # Leave out the first warnings, which were printed before the solver started.
+    page.warnings(document["warnings"][len(prepared.warnings) :])
+
+
+def _certificate(page: Page, solution: PostureSolution, collision: dict[str, Any] | None) -> None:
+    """Print the numbers of the certificate and the smallest distance between bodies."""
     certificate = solution.certificate
     page.line(
         f"certificate ({certificate.recomputed_with}): stationarity {certificate.stationarity:.1e}, "
         f"violation {certificate.primal:.1e}, "
         f"pose error {certificate.pose_error_m:.1e} m, {certificate.pose_error_rad:.1e} rad"
     )
-    if "collision" in document:
-        at = document["collision"]["optimal"]
-        bare = len(document["collision"]["links_without_shapes"])
+    if collision is not None:
+        at, bare = collision["optimal"], len(collision["links_without_shapes"])
         among = f" among the links that have shapes ({bare} ha{'ve' if bare > 1 else 's'} none)" if bare else ""
         page.line(f"no collision{among}; closest: {at['closest']}, {1e3 * at['distance']:.3g} mm")
+
+
+def _solves(page: Page, solution: PostureSolution) -> None:
+    """Print the number of certified solves, and each optimum with the number of solves that ended there."""
     # Count optima by their printed values, because the values of mirrored postures differ only by rounding errors.
     hits = Counter[str]()
     for optimum in solution.optima:
@@ -110,15 +128,6 @@ def summarize(page: Page, prepared: Prepared, solution: PostureSolution, documen
         + (f"{left} stopped early (--finish-all finishes them); " if left else "")
         + f"optima: {optima}"
     )
-    page.line(document["search"]["line"])
-    if "global" in document:
-        page.line(document["global"]["line"])
-    if "tradeoff" in document:
-        _tradeoff(page, document, [n for n in document["notes"] if n.startswith("trade-off:")])
-    if "path" in document:
-        _path(page, document["path"])
-    # Leave out the first warnings, which were printed before the solver started.
-    page.warnings(document["warnings"][len(prepared.warnings) :])
 
 
 def _holding(page: Page, before: dict[str, Any] | None, after: dict[str, Any] | None) -> None:

@@ -175,29 +175,16 @@ def render(
     points, robot = tuple((p.frame, p.offset, p in s.turning) for p in s.points), s.robot
     code = dynamics_code(robot, points, shared=shared)
     sizes = s.sizes
-    nv, equations, bounds = sizes["NV"], sizes["EQUATIONS"], sizes["SIMPLE"] + sizes["GENERAL"]
-    n, m = sizes["VARIABLES"], sizes["GENERAL"] - sizes["BOUNDED"]
-    more = {
-        "SCRATCH": max(3 * nv * nv, 2 * n * (n + equations) + 2 * equations * equations),
-        "BOUNDS": bounds,
-        "GAVE": 1 + sizes["LEVELS"],
-        "RELAXATION": _relaxation_room(n, m, 1 + sizes["LEVELS"]),
-    }
-    held, rows = sizes["HELD"], sizes["FLOW_ROWS"]
-    more["FLOW_WORK"] = max(3 * held * held + held * nv, 2 * nv * nv, rows * nv)
-    room = {name: max(1, value) for name, value in (sizes | more).items()}
-    n += 1
-    solver = 8 * (n * (n + 1) // 2 + 12 * n + 2 * max(bounds, 2 * rows)) + 2048
     tables = [(name, *table(values)) for name, values in s.tables.items()]
     tables.append(("gravity", *table(np.array(robot.model.gravity.linear, dtype=float))))
     tables.append(("allocation", *table(s.actuators.G[: sizes["BASE"], : sizes["ROTORS"]])))
     named_fields = [(field.name, k) for k, field in enumerate(fields, 1) if field.name in _NAMED]
     context: dict[str, Any] = {
-        "robot": robot.name, "version": __version__, "prefix": prefix, "sizes": sizes, "room": room, "fields": fields,
+        "robot": robot.name, "version": __version__, "prefix": prefix, "sizes": sizes, "room": _room(sizes),
         "q_names": list(robot.q_names), "v_names": robot.tangent_names, "u_names": s.actuators.names,
         "convention": robot.convention, "tasks": [t.name for t in s.tasks] or ["none"], "metric": metric,
-        "shared": fields[-1].value.size if shared else 0,
-        "stack_bytes": -(-max(code.stack_bytes, solver + 16 * nv * 8) // 64) * 64 + _FRAMES,
+        "fields": fields, "shared": fields[-1].value.size if shared else 0,
+        "stack_bytes": -(-max(code.stack_bytes, _solver_stack(sizes)) // 64) * 64 + _FRAMES,
         "identity": identity, "tables": tables, "named": named_fields, "literals": _initializer,
         "rules": _braced(str(x) for f in fields for x in (f.value.size, RULES[f.rule])),
         "constants": [(name, repr(getattr(module, name)), module.__name__.rpartition(".")[2])
@@ -238,6 +225,26 @@ def _files(sizes: dict[str, int]) -> list[str]:
     needed = {"eigen.c": sizes["ROBUST"] or sizes["FLOW"]}
     needed |= {name: sizes["FLOW"] for name in _CORE if name.startswith("reference_flow")}
     return [name for name in _CORE if needed.get(name, True)]
+
+
+def _room(sizes: dict[str, int]) -> dict[str, int]:
+    """Return the lengths of the arrays in the C code, at least 1, by the names of the sizes and of further arrays."""
+    nv, equations, levels = sizes["NV"], sizes["EQUATIONS"], 1 + sizes["LEVELS"]
+    n, held, rows = sizes["VARIABLES"], sizes["HELD"], sizes["FLOW_ROWS"]
+    more = {
+        "SCRATCH": max(3 * nv * nv, 2 * n * (n + equations) + 2 * equations * equations),
+        "BOUNDS": sizes["SIMPLE"] + sizes["GENERAL"],
+        "GAVE": levels,
+        "RELAXATION": _relaxation_room(n, sizes["GENERAL"] - sizes["BOUNDED"], levels),
+        "FLOW_WORK": max(3 * held * held + held * nv, 2 * nv * nv, rows * nv),
+    }
+    return {name: max(1, value) for name, value in (sizes | more).items()}
+
+
+def _solver_stack(sizes: dict[str, int]) -> int:
+    """Return the stack bytes of the solver of a QP and of the function that calls the solver."""
+    n, bounds = sizes["VARIABLES"] + 1, max(sizes["SIMPLE"] + sizes["GENERAL"], 2 * sizes["FLOW_ROWS"])
+    return 8 * (n * (n + 1) // 2 + 12 * n + 2 * bounds + 16 * sizes["NV"]) + 2048
 
 
 def _relaxation_room(n: int, m: int, levels: int) -> int:
