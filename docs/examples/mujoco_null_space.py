@@ -23,7 +23,8 @@ MJCF = Path(__file__).parent / "rail_arm_mjcf" / "rail_arm.xml"
 NORMAL = (0.0, 0.0, 1.0)
 DURATION = 3.0  # duration of the simulation, s
 STIFFNESS, DAMPING = 400.0, 40.0  # stiffness and damping of the tool controller, 1/s² and 1/s
-D, SPEED = 10.0, 2.0  # damping in the null space, 1/s; norm of K/D M⁻¹∇H at the start, which gives K
+D = 10.0  # damping in the null space, 1/s
+SPEED = 2.0  # K is chosen so that the norm of K/D M⁻¹∇H is this speed at the start
 
 
 def null_space_torque(M: np.ndarray, J: np.ndarray, torque: np.ndarray) -> np.ndarray:

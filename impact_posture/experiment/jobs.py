@@ -114,7 +114,7 @@ def execute(job: Job, factory: ControllerFactory | None = None) -> tuple[tuple[R
     factory.compile = job.compile
     scenario = factory.setup.scenario
     if job.sign is not None and job.sign not in scenario.signs:
-        raise InputError(f"has no push with sign {job.sign}", where=scenario.name, hint="omit `sign`")
+        raise InputError(f"has no push in the direction {job.sign:+d}", where=scenario.name, hint="omit `sign`")
     runs = run(factory, job.controller, seed=job.seed, mode=job.mode, gain=job.gain, only=job.sign)
     metrics = [measure(factory.setup, record) for record in runs]
     predictions = [predict(factory.setup, factory.objective(), record) for record in runs]

@@ -150,7 +150,10 @@ def _outcome(row: Document, nominal: Document) -> str:
 
 
 def _load(means: Mapping[str, float], joint: Document | None) -> ImpactLoad:
-    """Return the effects on base, joints and contact from means of :data:`QUANTITIES` and the worst ``joint``."""
+    """Return the effects on base, joints and contact, given the mean of each of :data:`QUANTITIES`.
+
+    ``joint`` is the worst joint.
+    """
     worst = joint and WorstJoint(joint["name"], means["joint_velocity"], joint["unit"], means.get("joint_share"))
     base = means.get("base_linear"), means.get("base_angular")
     return ImpactLoad(*base, worst or None, means["impulse"], means["peak_force"], means["peak_jump"])

@@ -21,8 +21,8 @@ Moment = tuple[Array, Array, Array]
 class RowInterpolation:
     """Motion through rows of positions, velocities and accelerations, by polynomials of degree 5 between the rows.
 
-    The polynomial gives the tangent coordinates at the earlier of the two rows: for a joint of one axis, the change
-    of its angle or travel.
+    The polynomial is the tangent vector from the earlier of the two rows to the posture.  For a joint of one axis,
+    its entry is the change of angle or travel since this row.
 
     Attributes:
         t: Times of the rows, s, shape (n,).

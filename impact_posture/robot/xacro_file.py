@@ -63,7 +63,7 @@ class _Packages:
             if self._ros is not None:
                 return str(self._ros.get_package_share_directory(package))
         near = sorted(entry.name for place in self._places[:3] for entry in place.glob("[!.]*/"))
-        hint = "name the folder above it with `package_dir`"
+        hint = "give the folder that contains this package as `package_dir`"
         raise PackageNotFound(package, near, where=str(self._path), hint=hint)
 
     @contextmanager

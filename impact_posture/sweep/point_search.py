@@ -36,7 +36,7 @@ Place = tuple[Any, Any]
 
 
 class Start(NamedTuple):
-    """Start posture ``q``, shape (nq,), and the final solver state ``end`` at ``q`` (``None`` if it is unknown)."""
+    """Start posture ``q``, shape (nq,), and ``end``, the state of a solver that ended at ``q`` (or ``None``)."""
 
     q: Array
     end: WarmStart | None = None

@@ -48,7 +48,7 @@ def test_of_contacts_that_act_at_once() -> None:
 
 
 def functions_of(program: Program) -> tuple[ca.Function, ca.Function]:
-    """Return the Jacobian and the upper Hessian of the objective and its equations, in closed form and by CasADi."""
+    """Return Jacobian and upper triangle of the Hessian of ``lifted``, in closed form and by CasADi."""
     lifted = program.lifted
     assert lifted.jumps
     unknowns = ca.vertcat(program.rows.x, lifted.variables)

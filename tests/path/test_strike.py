@@ -398,7 +398,7 @@ def test_files_mark_the_contact(tmp_path: Path) -> None:
         read_path(tmp_path, block, loaded)
 
 
-# How a strike is damaged: entries of its block, or rows of a file that are left.
+# How a strike is damaged: an entry of its block is replaced, or only these rows of a file are kept.
 DAMAGED: dict[str, dict[str, object]] = {
     "text": {"run_up_s": "x"},
     "no number": {"share": None},

@@ -110,7 +110,7 @@ def violations(tick: RelaxedTick, z: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def missed(tick: RelaxedTick, z: np.ndarray) -> list[float]:
-    """Return the largest violation of each level, starting with level 0, in units of the size of the point."""
+    """Return the largest relative violation of each level, starting with level 0 (relative to the size of ``z``)."""
     over, counts = violations(tick, z)
     sizes = COUNTS * np.abs(over) / np.where(counts > 0, counts, np.inf)
     return [float(np.max(sizes[tick.level == k], initial=0.0)) for k in range(int(tick.level.max()) + 1)]

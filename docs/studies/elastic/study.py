@@ -80,7 +80,7 @@ STUDIED = {
     ),
     "talos arm": Studied(
         talos_arm, "gripper_right_base_link", tuple(f"arm_right_{k}_joint" for k in range(1, 8)), ASSUMED,
-        "right arm with the pelvis fixed and all else rigid, springs as for `panda` **assumed**",
+        "right arm; the pelvis is fixed, all other joints are rigid, and the springs of `panda` are **assumed**",
     ),
 }  # fmt: skip
 

@@ -32,8 +32,9 @@ class Measured:
 class ElasticWorld:
     """Arm on a fixed base.  Each joint turns about one axis.
 
-    The body of a rotor has the same parent as the link, and turns about the same axis.  A fixed tendon acts as spring
-    and damper between both joints.  So the rotor has inertia only about its axis, like an armature.  Gravity and
+    Each joint has a rotor, whose body has the same parent as the link of the joint, and turns about the same axis.  A
+    fixed tendon acts as spring and damper between rotor and link.  The rotor has inertia only about its axis, like an
+    armature.  Gravity and
     joint limits are off.  The contact pushes with ``f = kδ`` along the normal at the contact point.  Depth and
     direction of the contact are updated while the arm moves.
     """

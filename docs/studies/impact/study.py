@@ -176,7 +176,10 @@ class Dropped:
 
 @dataclass(frozen=True)
 class Choice:
-    """Optimal posture of an objective, or the start.  Measurements by friction are ``None`` without an impact."""
+    """Optimal posture of an objective, or the start posture.
+
+    ``measured`` maps each friction coefficient to a measurement, or to ``None`` if no impact occurs.
+    """
 
     robot: str
     objective: str

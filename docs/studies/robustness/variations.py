@@ -31,9 +31,9 @@ class Range:
 
 
 _COMMON = (
-    Range("armature", 0.1, 3.0, "armature of every joint, times the scenario's", "log"),
-    Range("gain", 0.25, 4.0, "K, times the scenario's", "log"),
-    Range("contact", 0.25, 4.0, "stiffness of the surface, times the scenario's", "log"),
+    Range("armature", 0.1, 3.0, "factor on the armature of every joint", "log"),
+    Range("gain", 0.25, 4.0, "factor on K", "log"),
+    Range("contact", 0.25, 4.0, "factor on the stiffness of the surface", "log"),
 )
 _TOOL = (
     Range("tilt", -5.0, 5.0, "angle between tool and normal in the plane of the arm, degrees"),
@@ -46,8 +46,8 @@ def _pushed(stir: float) -> tuple[Range, ...]:
     words = "size of the random changes of the joints at the start, rad; the feet stay in place"
     return (
         Range("stir", 0.02, stir, words),
-        Range("force", 0.6, 1.4, "force of the push, times the scenario's"),
-        Range("stiffness", 0.5, 2.0, "gains of center of mass, base and posture, times the scenario's", "log"),
+        Range("force", 0.6, 1.4, "factor on the force of the push"),
+        Range("stiffness", 0.5, 2.0, "factor on the gains of center of mass, base and posture", "log"),
         Range("friction", 0.5, 1.0, "friction of the ground"),
         *_COMMON,
     )

@@ -29,7 +29,7 @@ class EffectiveMassKind(CoulombKind):
         """Return the effective mass at ``q``, kg, computed with Pinocchio.
 
         Raises:
-            MetricError: The contact point cannot move along the normal, or only with a slip that friction prevents.
+            MetricError: The contact point cannot move along the normal without a slip that friction prevents.
         """
         if self.oracle.quantities(q).blocked:
             raise MetricError("is unbounded", where="effective mass", hint="the contact cannot move along the normal")

@@ -15,7 +15,7 @@ from impact_posture.tsid.support_contact import SupportContact
 ZMP_SHARE = 0.8
 # A shorter distance from the center of mass to an edge is replaced by this distance, m.
 ZMP_LEAST = 0.01
-# A row of the bounds is ignored if the square of its length along the free directions is smaller than this.
+# A bound is ignored if the squared norm of its row, projected onto the null space of the feet, is smaller than this.
 _TINY = 1e-12
 
 
