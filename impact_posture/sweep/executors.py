@@ -25,12 +25,15 @@ class DaskWorkers(Executor):
         self._client, self._executor, self._address = client, client.get_executor(), address
         # Time at which the cluster last had workers, s.  A new cluster may wait for its first worker.
         self._last_workers = math.inf
-        self.check()
 
     def submit(self, function: Callable[..., Any], /, *arguments: Any, **named: Any) -> Future[Any]:
         """Submit one call as a task."""
         future: Future[Any] = self._executor.submit(function, *arguments, **named)
+        future.add_done_callback(self._saw_workers)
         return future
+
+    def _saw_workers(self, _: object = None) -> None:
+        self._last_workers = time.monotonic()
 
     def check(self) -> None:
         """Ask the scheduler for its workers, because a scheduler that is stopped keeps its connections open.
@@ -44,7 +47,7 @@ class DaskWorkers(Executor):
         except OSError:
             raise TimeoutError(f"{self._address} does not answer") from None
         if workers:
-            self._last_workers = time.monotonic()
+            self._saw_workers()
         elif time.monotonic() - self._last_workers > _WITHOUT_WORKERS:
             raise TimeoutError(f"{self._address} has had no workers for {_WITHOUT_WORKERS} s")
 

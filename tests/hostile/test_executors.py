@@ -16,11 +16,12 @@ import time
 from collections.abc import Callable
 from concurrent.futures import CancelledError, Executor, Future
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from impact_posture.errors import WorkerDied
-from impact_posture.sweep import sweep_run
+from impact_posture.sweep import executors, sweep_run
 from impact_posture.sweep.sweep_file import read_sweep
 from impact_posture.sweep.sweep_run import run_sweep
 from tests.hostile.arena import Outcome
@@ -79,6 +80,18 @@ def test_an_executor_that_does_not_answer(sweep: Path, tmp_path: Path, monkeypat
     monkeypatch.setattr(sweep_run, "_PAUSE", 0.01)
     with pytest.raises(WorkerDied, match=r"tcp://host has not answered for 30 s\); check them, and run the command"):
         run_sweep(read_sweep(sweep), tmp_path / "out", Stopped())
+
+
+def test_a_dask_cluster_loses_all_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(executors, "_WITHOUT_WORKERS", 0)
+    answers = iter([{}, {"tcp://worker": 1}, {}])
+    scheduler = SimpleNamespace(ncores=None)
+    client = SimpleNamespace(get_executor=lambda: None, scheduler=scheduler, sync=lambda *_, **__: next(answers))
+    workers = executors.DaskWorkers(client, "tcp://host:1")
+    workers.check()  # the cluster may wait for its first worker
+    workers.check()
+    with pytest.raises(TimeoutError, match="tcp://host:1 has had no workers for 0 s"):
+        workers.check()
 
 
 @pytest.mark.parametrize("victim", ["scheduler", "worker", "all workers", "stopped scheduler", "stopped, Ctrl-C"])
