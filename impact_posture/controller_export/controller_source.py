@@ -27,10 +27,11 @@ from impact_posture.dynamics.model_parameters import ModelParameters
 from impact_posture.impact.impact_contact import point_on
 from impact_posture.impact.quantities.impact_kernel import ImpactKernel
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.robot import support_polygon
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 from impact_posture.system.escape import c_comment
-from impact_posture.tsid import controller, relaxation
+from impact_posture.tsid import controller, relaxation, support_contact
 from impact_posture.tsid.flow import (
     flow_direction,
     flow_governor,
@@ -61,6 +62,8 @@ _NAMED = ("control_upper", "joint_upper", "contact_normal", "law_rate", "posture
 _CONSTANTS = {
     controller: "LONGEST ABSURD",
     relaxation: "OFF",
+    support_contact: "ACROSS",
+    support_polygon: "ON_LINE",
     level_rank: "SINGULAR DROPPED LEAST",
     reference_flow: "PROBE MOVED REACHED STILL SLOW UPDATE_TICKS UNTIL SINCE",
     flow_probes: "NEW",

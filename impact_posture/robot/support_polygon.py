@@ -8,9 +8,9 @@ import numpy as np
 
 from impact_posture.system.arrays import Array, nonnegative_least_squares
 
-# A point within the distance ``_ROUNDING`` (m) of a line counts as on the line.  Edges are rounded to ``_DIGITS``
+# A point within the distance ``ON_LINE`` (m) of a line counts as on the line.  Edges are rounded to ``_DIGITS``
 # decimals.
-_ROUNDING, _DIGITS = 1e-9, 12
+ON_LINE, _DIGITS = 1e-9, 12
 
 
 def convex_ring(points: Array) -> list[int]:
@@ -48,7 +48,7 @@ def polygon_edges(points: Iterable[Array]) -> tuple[Array, Array] | None:
         # A corner of the hull near the line through its neighbors lies between them.
         around = zip(np.roll(corners, 1, axis=0), np.roll(corners, -1, axis=0), corners, strict=True)
         heights = [_height(*points) for points in around]
-        if min(heights) >= _ROUNDING:
+        if min(heights) >= ON_LINE:
             break
         corners.pop(int(np.argmin(heights)))
     if len(corners) < 3:

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from impact_posture.controller_export.compiled_controller import TARGET
 from impact_posture.errors import CompilerError
 from impact_posture.simulation.controllers.compiled_tick import CompiledTick
 from impact_posture.simulation.scenario_objective import locked
@@ -29,8 +30,10 @@ from impact_posture.system.libraries import (
 from impact_posture.system.optional_package import import_mujoco, unwarned
 
 _NAME = "world_ticks"
-# Maximum number of propellers in the C loop, the same as ``ROTORS`` in ``world_ticks.c``.
+# Maximum number of propellers in the C loop.
 _ROTORS = 64
+# Compiler options that define constants of the C loop.
+_DEFINED = (f"-DROTORS={_ROTORS}", f"-DTARGET={TARGET}")
 
 
 class Ticks(NamedTuple):
@@ -155,10 +158,10 @@ def _library() -> ctypes.CDLL | None:
     headers = Path(import_mujoco().__file__).parent / "include"
     if not (headers / "mujoco" / "mujoco.h").is_file():
         return None
-    folder = cache_folder("worlds", source_key([str(import_mujoco().__version__), _source()]))
+    folder = cache_folder("worlds", source_key([str(import_mujoco().__version__), *_DEFINED, _source()]))
     library = library_path(folder, _NAME)
     with locked(folder.with_suffix(".lock")):
         if not is_cached(library):
             (folder / f"{_NAME}.c").write_text(_source(), encoding="utf-8")
-            build_library(folder, _NAME, flags=["-isystem", str(headers)])
+            build_library(folder, _NAME, flags=["-isystem", str(headers), *_DEFINED])
     return load_library(library)

@@ -19,6 +19,9 @@ from impact_posture.tsid.point_kinematics import Point
 from impact_posture.tsid.qp.quadratic_program import stacked_rows
 from impact_posture.tsid.state import State
 
+# Least length of the part of a heading that is orthogonal to the normal.
+ACROSS = 1e-6
+
 
 @checked
 @dataclass(frozen=True, eq=False)
@@ -186,7 +189,7 @@ def to_world(cone: Array, normal: Array, heading: Array) -> Array:
         ContactError: The ``heading`` of a sole is parallel to the normal.
     """
     x = heading - normal * (normal @ heading)
-    if np.linalg.norm(x) < 1e-6:
+    if np.linalg.norm(x) < ACROSS:
         if cone.shape[1] == 6:
             raise ContactError("the sole stands on its edge", where="contact", hint="put the sole on the ground")
         other = np.eye(3)[int(np.argmin(np.abs(normal)))]

@@ -1,8 +1,5 @@
 /* Contacts with the ground: desired accelerations, target poses, and friction cones. */
 
-/* Least length of the part of a heading that is orthogonal to the normal. */
-#define IP_ACROSS 1e-6
-
 /* Return the row of a contact Jacobian that belongs to an entry of f. */
 static const double *ip_contact_motion(const ip_context *c, int entry)
 {

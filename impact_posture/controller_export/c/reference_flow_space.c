@@ -1,9 +1,6 @@
 /* Redundancy of the reference flow, and the static controls that hold its posture.  The formulas are in
  * impact_posture/tsid/flow/redundancy.py and static_controls.py. */
 
-/* Points with a smaller distance from a line, m, are treated as points on the line. */
-#define IP_ON_LINE 1e-9
-
 #if IP_BASE
 /* Solve R'R x = b in place, R upper triangular in n x n. */
 static void ip_solve_factor(const double *R, int n, double *b)

@@ -1,16 +1,12 @@
 /* Ticks of a simulated world with a controller in C.  The results are the same as with the class World in world.py,
  * with the sensors of sensor_noise.py, the propellers of rotors.py and the contacts of contact_forces.py.  These Python
- * files explain the terms. */
+ * files explain the terms.  compiled_world.py defines ROTORS and TARGET. */
 #include <math.h>
 #include <string.h>
 
 #include <mujoco/mujoco.h>
 
 #define PI 3.14159265358979323846
-/* Maximum number of propellers. */
-#define ROTORS 64
-/* Number of values in a target of the controller. */
-#define TARGET 25
 /* If the square of an angle is below this value, power series replace sine and cosine. */
 #define SMALL 1e-8
 
