@@ -184,16 +184,18 @@ def _path(page: Page, path: dict[str, Any]) -> None:
     else:
         page.line("path: the start is the optimum" if path["found"] else "path: no path leads away from the start")
     if strike := path.get("strike"):
+        falls = path["timing"] == FREE_FALL
         page.line(
             f"  strikes at {number(strike['speed'])} m/s, with {strike['share']:.0%} of the velocity limits, after a "
-            f"run-up of {1e3 * strike['run_up_m']:.3g} mm from rest at {strike['run_up_s']:.3g} s"
+            f"{'fall' if falls else 'run-up'} of {1e3 * strike['run_up_m']:.3g} mm from rest at "
+            f"{strike['run_up_s']:.3g} s"
         )
         if strike["hindrance"]:
             page.line(f"  {number(strike['stated_speed'])} m/s is not possible, because of {strike['hindrance']}")
         after = strike["follow_through"]
         stops = f"then stops within {number(after['longest_s'])} s after {after['stopped']}"
         # The feet of a robot that falls are pressed onto the ground, so only plastic impacts are considered.
-        rebounds = "" if path["timing"] == FREE_FALL else f" to {RESTITUTIONS[-1]:g}"
+        rebounds = "" if falls else f" to {RESTITUTIONS[-1]:g}"
         page.line(
             f"  {stops if after['stopped'] else 'no stop along the velocity exists after any'} of {after['impacts']} "
             f"considered impacts (restitution {RESTITUTIONS[0]:g}{rebounds}, "

@@ -172,6 +172,8 @@ def _stop(
     Per length of the curve, the normal velocities of the contact points are constant, so contact points rebound.  If
     the robot falls, the velocity of its center of mass is constant instead, so the ground need not pull the feet.
     """
+    if falls and limits.missing:
+        return f"no stop exists, because {limits.missing}"
     space = spaces.rebound
     held = equality_jacobian(space.problem, Numeric(space.model).at(q))
     velocity = velocity - np.linalg.pinv(held, rcond=1e-9) @ (held @ velocity)

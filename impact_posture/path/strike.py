@@ -77,17 +77,18 @@ class Strike(JsonBlock):
 def check_strike(problem: ConstrainedProblem, speed: float) -> None:
     """Raise ``InputError`` unless contacts with held positions can arrive at a speed above zero, m/s.
 
-    A robot that falls freely can only land on level ground.
+    A robot that falls freely can only land on level ground, whose normals do not turn with the contact frames.
     """
     fault, hint = "", "leave out `strike`"
     wanted, gravity = problem.requirements, problem.robot.model.gravity.linear
     normals = np.array([single.oracle.at(problem.given).n for single in problem.impact.singles])
+    turn = any(contact.normal_frame == "contact" for contact in problem.objective.contacts)
     loose = [pose for pose in (wanted.contact_pose, *wanted.other_poses) if pose in ("free", "box")]
     if loose:
         fault, hint = f"needs a held contact, but `contact_pose` is {loose[0]}", "hold it: full, position or aligned"
     elif not speed > 0:
         fault, hint = "needs an approach speed above zero", "give `speed`"
-    elif falls_freely(problem) and np.abs(normals + gravity / np.linalg.norm(gravity)).max() > _TILT:
+    elif falls_freely(problem) and (turn or np.abs(normals + gravity / np.linalg.norm(gravity)).max() > _TILT):
         fault, hint = "needs level ground, because nothing supports the robot, so it falls", "give `support`"
     if fault:
         raise InputError(fault, where="strike", hint=hint)
@@ -232,11 +233,10 @@ def _fall(problem: ConstrainedProblem, q: Array, speed: float) -> RunUp | str:
     if blocked := dict.fromkeys(name for name, size, tolerance in checked if size > tolerance):
         return f"the fall violates: {', '.join(blocked)}"
     rows, height = RowInterpolation(model, t, postures, np.outer(t, a), np.tile(a, (len(t), 1))), speed * end / 2
-    note = f"the robot begins to fall at rest, {height:.3g} m above the optimum"
     strike = Strike(
         speed=speed, stated_speed=speed, run_up_s=0.0, run_up_m=height, contact_s=end, velocity=rows.v[-1], share=0.0
     )
-    return RunUp(TimedCurve(rows, FREE_FALL, (note,)), strike, spaces)
+    return RunUp(TimedCurve(rows, FREE_FALL), strike, spaces)
 
 
 def _timed_run_up(

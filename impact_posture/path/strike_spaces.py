@@ -41,7 +41,7 @@ def falls_freely(problem: ConstrainedProblem) -> bool:
     """Return whether a robot falls before the impact, because it has neither rotors, nor feet, nor a fixed base."""
     robot = problem.robot
     held = robot.spec.propulsion is not None or problem.objective.supports or problem.requirements.base == "fixed"
-    return robot.floating and not held
+    return bool(robot.floating and np.any(robot.model.gravity.linear) and not held)
 
 
 def landed(problem: ConstrainedProblem, q: Array) -> ConstrainedProblem:

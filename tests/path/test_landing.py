@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -13,14 +14,15 @@ from scipy.optimize import linprog
 
 from impact_posture.controller_export.controller_structure import structure_of
 from impact_posture.controller_export.path_source import path_reference, render_path
+from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import InputError
-from impact_posture.impact.impact_contact import ImpactContact
+from impact_posture.impact.impact_contact import ImpactContact, point_on
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.path.follow_through import RESTITUTIONS
 from impact_posture.path.path_files import read_path, write_path
 from impact_posture.path.posture_path import PosturePath, posture_path
 from impact_posture.path.strike import check_strike, impact_velocity
-from impact_posture.path.strike_spaces import StrikeSpaces
+from impact_posture.path.strike_spaces import StrikeSpaces, falls_freely
 from impact_posture.posture.constraints.requirements import Requirements
 from impact_posture.posture.formulation.build_problem import build_problem
 from impact_posture.posture.formulation.problem_file import prepare
@@ -186,6 +188,37 @@ def test_a_robot_that_falls_lands_only_on_level_ground() -> None:
         check_strike(prepare(make_settings(task)).problem, 1.0)
 
 
+def test_a_robot_whose_contacts_turn_with_its_links_does_not_fall() -> None:
+    """In the given posture, the ground is level, but at another posture the normal of the foot is another one."""
+    task = {"robot": "solo12", "frame": "FL_FOOT", "contact_pose": "position", "support": ()}
+    level = prepare(make_settings({**task, "normal": (0, 0, 1)})).problem
+    up = Numeric(level.robot.model).at(level.given).placement(point_on(level.robot, "FL_FOOT")).rotation[2]
+    turning = prepare(make_settings({**task, "normal": tuple(up.tolist()), "normal_frame": "contact"})).problem
+    with pytest.raises(InputError, match="needs level ground"):
+        check_strike(turning, 1.0)
+
+
+def test_a_robot_without_gravity_does_not_fall() -> None:
+    task = {"robot": "solo12", "frame": "FL_FOOT", "normal": (0, 0, 1), "contact_pose": "position", "support": ()}
+    problem = prepare(make_settings(task)).problem
+    floating = replace(problem, robot=replace(problem.robot, model=problem.robot.model.copy()))
+    floating.robot.model.gravity.linear = np.zeros(3)
+    check_strike(floating, 1.0)
+    assert not falls_freely(floating) and falls_freely(problem)
+
+
+def test_a_robot_that_cannot_stand_on_its_contacts_does_not_stop() -> None:
+    """On two point feet, nothing resists a rotation about the line through both."""
+    task = {
+        "robot": "solo12", "contact": ("FL_FOOT:0,0,1", "HR_FOOT:0,0,1"), "contact_pose": "position", "normal": None,
+        "support": (), "base": "level", "limit_margin": 0.5,
+    }  # fmt: skip
+    strike = posture_path(solve(prepare(make_settings(task)).problem, starts=1, jobs=1), strike=SPEED).strike
+    after = strike and strike.follow_through
+    assert after and after.stopped == 0 and after.rows is None
+    assert "cannot balance the robot at rest" in after.hindrance
+
+
 def test_a_controller_that_stands_is_not_exported_with_a_fall() -> None:
     solution, path = landed_path()
     robot = solution.problem.robot
@@ -207,4 +240,5 @@ def test_a_fall_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
     _path(Page(), json.loads(json.dumps(landed_path()[1].to_dict())))
     text = " ".join(capsys.readouterr().out.split())
     assert "path to the optimum by free fall" in text and "4 of 4 considered impacts (restitution 0, 80%" in text
-    assert "the robot begins to fall at rest, 0.051 m above the optimum" in text
+    assert "after a fall of 51 mm from rest" in text
+    assert not landed_path()[1].reason

@@ -225,7 +225,7 @@ def motion_figure(view: ResultView) -> Figure:
     use = required(motion.use, "motion", "path", "run optimize again with `path`")
     notes = [_NOTES.get(motion.timing, "")]
     notes += [f"Note: {motion.reason}."] if motion.reason else []
-    notes += ["Dotted lines: start of the run-up (the speed rises smoothly), and contact."] if motion.strike else []
+    notes += ["Dotted lines: start of the run-up or of the fall, and contact."] if motion.strike else []
     with framed(*header_lines(view), 6.2, notes) as (figure, body):
         joints, objective, shares = body.subplots(3, 1, sharex=True, height_ratios=[1.4, 1, 1])
         # The curves show the integral of the velocity, because an angle would jump after a full turn.
