@@ -128,7 +128,7 @@ def _export_world(page: Page, scenario: Scenario, out: Path, force: bool) -> Non
 
 
 def _rigid(prediction: dict[str, Any]) -> str:
-    if prediction["sticking"] is None:
+    if prediction["coulomb"] is None:
         return f"{number(prediction['frictionless'], missing='–')} without a controller"
     named = {
         "frictionless": "without friction",

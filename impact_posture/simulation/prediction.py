@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -36,7 +36,7 @@ class Prediction:
         frictionless: Predicted jump without friction, ``(1+e) v √V``.  For pushes, ``√H`` times the impulse: the
             velocity of a robot without controller at the end of the push.
         sticking: Predicted jump if the contact sticks, ``(1+e) v √S``, for an approach along the normal; ``None``
-            for pushes and if S is undefined.
+            for pushes, falls, and if S is undefined.
         coulomb: Predicted jump with the friction of the surface, ``(1+e) v √C``, for an approach along the normal;
             ``None`` for pushes.
         measured: Measured jump (``peak_jump`` in :class:`~impact_posture.simulation.metrics.Metrics`).
@@ -67,7 +67,8 @@ def predict(setup: Setup, objective: WorstCaseObjective, run: Run) -> tuple[Pred
     """Predict each impact of a run with the rigid-body model at the last state before the impact.
 
     The contact law of the surface (or ball) determines the restitution
-    (:meth:`~impact_posture.simulation.world.contact_law.ContactLaw.restitution`).
+    (:meth:`~impact_posture.simulation.world.contact_law.ContactLaw.restitution`).  After a fall, all contacts
+    strike together, but H, G, V and S are for the first contact alone.
     """
     scenario, predictions = setup.scenario, []
     numeric = Numeric(setup.robot.model)
@@ -99,9 +100,13 @@ def predict(setup: Setup, objective: WorstCaseObjective, run: Run) -> tuple[Pred
             sticking = None if here.S is None else rebound * float(np.sqrt(here.S))
             impact = coulomb_impact(objective.oracle, q)
             velocity, impulse = rebound * impact.jump, rebound * impact.mass
-            together = coulomb_jumps(objective, q, rebound) if scenario.falls else None
-            if together is not None:
-                velocity, impulse = together[0].velocity, sum(each.normal_impulse for each in together)
+            if scenario.falls:
+                first, *others = (replace(contact, friction=0.0) for contact in objective.contacts)
+                slippery = replace(objective, contact=first, others=tuple(others))
+                together, smoothly = (coulomb_jumps(each, q, rebound) for each in (objective, slippery))
+                if together and smoothly:
+                    velocity, impulse = together[0].velocity, sum(each.normal_impulse for each in together)
+                    smooth, sticking = smoothly[0].norm, None
             coulomb = float(np.sqrt(velocity @ objective.oracle.weigh(velocity)))
         expected = smooth if coulomb is None else coulomb
         effect, measured = impact_effect(setup.robot, velocity), impact_load(setup, run.series, window)

@@ -15,7 +15,7 @@ from impact_posture.errors import InputError
 from impact_posture.experiment import jobs, reproduction
 from impact_posture.simulation import scenario_file
 from impact_posture.simulation.series import Series
-from impact_posture_cli.commands.simulate import _show
+from impact_posture_cli.commands.simulate import _rigid, _show
 from impact_posture_cli.output import Page
 from tests.experiment.conftest import shortened
 from tests.support.command import on_terminal
@@ -200,6 +200,13 @@ def test_simulate_prints_made_and_expected_contacts(capsys: pytest.CaptureFixtur
     text = " ".join(capsys.readouterr().out.split())
     assert "contacts 3 of 5" in text and "relaxed 7 of 900 ticks" in text and "held 2 ticks" in text
     assert "t = 1.25 s: lost contact: 2 of 5 contacts were never made" in text and "q_total" not in text
+
+
+def test_only_pushes_are_predicted_without_a_controller() -> None:
+    """If S does not exist, a contact has no sticking jump, but its jump is not the jump of a push."""
+    contact = {"frictionless": 2.0, "coulomb": 3.0, "sticking": None}
+    assert _rigid(contact) == "2 without friction, 3 with the friction of the surface, – sticking"
+    assert _rigid(contact | {"coulomb": None}) == "2 without a controller"
 
 
 def test_progress_is_for_terminals(aerial: Path, tmp_path: Path) -> None:

@@ -70,12 +70,20 @@ def test_the_prediction_counts_all_feet() -> None:
     factory, record = dropped()
     (prediction,), (window,) = predict(factory.setup, factory.objective(), record), record.of("impact")
     assert prediction.restitution is not None
-    jumps = coulomb_jumps(factory.objective(), record.series.q[before(record.series, window)], 1.0)
+    q = record.series.q[before(record.series, window)]
+    jumps = coulomb_jumps(factory.objective(), q, 1.0)
+    oracles = [single.oracle.at(q) for single in factory.objective().singles]
+    normal = np.array([oracle.n @ oracle.J for oracle in oracles])
+    responses = oracles[0].solve(normal.T)
+    smooth = responses @ np.linalg.solve(normal @ responses, np.ones(4))
     assert jumps is not None and len(jumps) == 4
     rebound = (1 + prediction.restitution) * prediction.approach
     assert prediction.predicted_impact.impulse == pytest.approx(rebound * sum(each.normal_impulse for each in jumps))
     assert prediction.coulomb == pytest.approx(rebound * np.linalg.norm(jumps[0].velocity))
     assert prediction.ratio == pytest.approx(1.0, abs=0.15)
+    # Without friction, the normal velocities stop, which a linear system of the four normals states.
+    assert prediction.frictionless == pytest.approx(rebound * np.linalg.norm(smooth), rel=1e-6)
+    assert prediction.sticking is None
 
 
 def test_after_the_contact_the_body_follows_the_planned_stop(monkeypatch: pytest.MonkeyPatch) -> None:
