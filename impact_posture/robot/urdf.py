@@ -191,7 +191,10 @@ def _read(path: Path) -> tuple[str, ET.Element]:
     # The search in the elements takes longer than the search in the text.
     if ("$" in text or "<xacro:" in text) and (leftover := _xacro_leftover(root)):
         fault = f"contains {leftover}, which only xacro can evaluate"
-        raise UrdfError(fault, where=str(path), hint="name the file .xacro")
+        hint = "name the file .xacro"
+        if leftover.startswith("<xacro:"):
+            hint += ", or remove this element in a copy, if it adds no links"
+        raise UrdfError(fault, where=str(path), hint=hint)
     return text, root
 
 
