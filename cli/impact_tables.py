@@ -29,7 +29,8 @@ def impact_rows(impact: ResolvedImpact, normals: Sequence[Iterable[Any]], axes: 
     objective, contact, metric = impact.objective, impact.contact, impact.metric
     rows = []
     for name, struck, normal in zip(contact_names(objective.contacts), objective.contacts, normals, strict=True):
-        limit = f", up to {struck.impulse:g} N·s" if objective.others else ""
+        bounded = objective.others and objective.impact_kind.adds_up
+        limit = f", up to {struck.impulse:g} N·s" if bounded else ""
         rows.append((f"normal at {name}" if objective.others else "normal", f"{vector(normal)} ({axes}){limit}"))
     if any(contact.offset):
         offset = ", ".join(f"{v:g}" for v in contact.offset)

@@ -215,13 +215,16 @@ def _worst_note(objective: WorstCaseObjective) -> str:
 def _several(joint: NamedObjective, test: dict[str, Any]) -> dict[str, Any]:
     """Return the template variables for the objective of several contacts at once."""
     objective = joint.objective
-    names = [f"({model.name})" for model in objective.model_variants]
+    names, bounded = [f"({model.name})" for model in objective.model_variants], objective.impact_kind.adds_up
+    box = "|impulse| up to" if objective.bilateral else "impulses from 0 to"
     return {
         "stem": Verbatim(joint.stem),
         "test": test,
-        "box": "|impulse| up to" if objective.bilateral else "impulses from 0 to",
+        "bounded": bounded,
+        "box": box if bounded else "contacts that arrive together and stick:",
         "contacts": [
-            f"{c.frame} ({', '.join(f'{v:.9g}' for v in c.normal)}) {c.impulse:g} N s" for c in objective.contacts
+            f"{c.frame} ({', '.join(f'{v:.9g}' for v in c.normal)})" + f" {c.impulse:g} N s" * bounded
+            for c in objective.contacts
         ],
         "models": ["The worst of the models", *names] if names else [],
     }

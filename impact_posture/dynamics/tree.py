@@ -196,6 +196,10 @@ class Tree(Kinematics):
         local, R = self.own_velocity(point, velocities), self.rotation(point)
         return ca.vertcat(R @ local[:3], R @ local[3:])
 
+    def point_velocities(self, points: Sequence[PointOnLink], velocities: ByJoint) -> ca.SX:
+        """Return the world linear velocities of m points, shape (3m,)."""
+        return ca.vertcat(*[self.point_velocity(point, velocities)[:3] for point in points])
+
     def own_velocity(self, point: PointOnLink, velocities: ByJoint) -> ca.SX:
         """Return the linear and angular velocity of a point in the axes of its frame, shape (6,)."""
         motion, axes = velocities[point.joint], constant(point.rotation).T

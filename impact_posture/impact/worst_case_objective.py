@@ -25,6 +25,7 @@ from impact_posture.impact.support_compliance import default_compliance
 from impact_posture.impact.worst_case.impulse_box import ImpulseBox, check_contacts
 from impact_posture.impact.worst_case.model_set import ModelSet
 from impact_posture.impact.worst_case.normal_cone import NormalCone, check_cone
+from impact_posture.impact.worst_case.simultaneous_impact import SimultaneousImpact
 from impact_posture.robot.model_variant import ModelVariant
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_spec import Support
@@ -49,7 +50,8 @@ class WorstCaseObjective:
         compliance: Compliance ε of the supports, 1/kg; zero selects the default.
         normal_cone_deg: Half angle of the cone of possible normals, degrees; 0 if only the normal of the contact is
             possible.
-        others: Contacts that are hit at the same time as the first contact, each with a bound on its impulse.
+        others: Contacts that are hit at the same time as the first contact: each with a bound on its impulse, or with
+            the type ``sticking`` all at the same approach speed.
         bilateral: Whether several contacts can pull as well as push.
         model_variants: Possible robot models, the nominal model first; empty if only the nominal model is possible.
     """
@@ -156,7 +158,8 @@ class WorstCaseObjective:
         if self.model_variants:
             return ModelSet(tuple(member.worst_case for member in self.by_variant))
         if self.others:
-            return ImpulseBox(tuple(single.oracle for single in self.singles), self.bilateral)
+            oracles = tuple(single.oracle for single in self.singles)
+            return ImpulseBox(oracles, self.bilateral) if self.impact_kind.adds_up else SimultaneousImpact(oracles)
         return self.normal_cone or self.impact_kind
 
     @cached_property

@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from impact_posture.errors import ContactError, ImpactPostureError, InputError, MetricError, SpecError
+from impact_posture.impact.evaluation.coulomb_jump import coulomb_jumps
 from impact_posture.impact.evaluation.evaluation import evaluate
 from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.impact.metric import Metric
@@ -136,6 +137,79 @@ def test_every_box(floating: bool, count: int, feet: int, metric: str, axes: str
         assert_close(symbolic[0], value, 1e-9, "CasADi's value")
         assert_close(symbolic[1], gradient, 1e-7, "CasADi's gradient", scale=value)
         assert_close(objective.subgradients(q).gradients, [gradient], 1e-12, "one gradient", scale=value)
+
+
+@pytest.mark.parametrize("axes", ["world", "contact"])
+@pytest.mark.parametrize(
+    ("count", "feet", "metric"), [(2, 0, "euclidean"), (2, 1, "kinetic"), (3, 0, "weighted"), (2, 1, "weighted")]
+)
+def test_every_simultaneous_impact(count: int, feet: int, metric: str, axes: str) -> None:
+    """The oracle is the KKT system of all contact points that stick, with dense matrices of Pinocchio."""
+    generator, condition = rng("simultaneous", count, feet, metric, axes), np.inf
+    # Two points of a link cannot move independently, and the impact is then not defined.
+    while condition > 1e3:
+        loaded = random_robot(generator, floating=True)
+        contacts = [
+            ImpactContact(f"f{k}", tuple(unit(generator)), tuple(0.1 * generator.normal(size=3)), axes)  # type: ignore[arg-type]
+            for k in range(count)
+        ]
+        (q,) = random_configurations(loaded.model, 1, int(generator.integers(10_000)), "simultaneous", spread=0.6)
+        J, n = [], []
+        for contact in contacts:
+            frame = loaded.frame_id(contact.frame)
+            R = frame_placement(loaded.model, q, frame).rotation if axes == "contact" else np.eye(3)
+            J.append(frame_jacobian(loaded.model, q, frame, contact.offset)[:3])
+            n.append(R @ contact.normal)
+        A, b = np.vstack(J), np.concatenate(n)
+        condition = float(np.linalg.cond(A))
+    weights = tuple(generator.uniform(0.2, 5.0, loaded.nv)) if metric == "weighted" else None
+    supports = tuple(Support(f"f{5 - k}", "point") for k in range(feet))
+    norm, others = Metric(metric, weights), tuple(contacts[1:])  # type: ignore[arg-type]
+    objective = WorstCaseObjective(loaded, contacts[0], norm, "sticking", supports, 1e-3, others=others)
+    M, rows = mass_matrix(loaded.model, q), [A]
+    rows += [frame_jacobian(loaded.model, q, loaded.frame_id(s.frame), s.offset)[:3] for s in supports]
+    C = np.vstack(rows)
+    soft = np.diag([*np.zeros(len(A)), *np.full(3 * feet, 1e-3)])
+    right = np.concatenate([np.zeros(loaded.nv), b, np.zeros(3 * feet)])
+    a = np.linalg.solve(np.block([[M, -C.T], [C, soft]]), right)[: loaded.nv]
+    W = M if metric == "kinetic" else np.diag(objective.metric.diagonal(loaded.nv))
+    value = objective.value(q)
+    assert_close(value, a @ W @ a, 1e-8, "the squared jump")
+    gradient = objective.gradient(q)
+    assert_close(gradient, central_gradient(objective.value, loaded.model, q, 1e-4), 1e-5, "gradient", scale=value)
+    symbolic = [np.array(v).ravel() for v in objective.gradient_fun()(q, objective.contact.normal)]
+    assert_close(symbolic[0], value, 1e-8, "CasADi's value")
+    assert_close(symbolic[1], gradient, 1e-6, "CasADi's gradient", scale=value)
+
+
+def test_a_simultaneous_impact_is_the_predicted_plastic_impact_if_all_feet_stick() -> None:
+    loaded = robot("solo12")
+    first, *others = [ImpactContact(s.frame, (0, 0, 1), s.offset, friction=2.0) for s in loaded.spec.supports]
+    objective = WorstCaseObjective(loaded, first, Metric(), "sticking", others=tuple(others))
+    jumps = coulomb_jumps(objective, loaded.posture(), 1.0)
+    assert jumps is not None and all(jump.sticks for jump in jumps)
+    assert_close(objective.value(loaded.posture()), jumps[0].velocity @ jumps[0].velocity, 1e-6, "squared jump")
+
+
+def test_a_simultaneous_impact_along_conflicting_normals_is_refused() -> None:
+    loaded = robot("panda")
+    first, second = (ImpactContact("panda_hand_tcp", normal) for normal in ((0, 0, 1), (1, 0, 0)))
+    objective = WorstCaseObjective(loaded, first, Metric(), "sticking", others=(second,))
+    with pytest.raises(MetricError, match="does not exist here"):
+        objective.value(loaded.posture())
+
+
+@pytest.mark.parametrize("feet", [(), ("HL_FOOT", "HR_FOOT")])
+def test_an_optimum_of_a_simultaneous_impact_certifies(feet: tuple[str, ...]) -> None:
+    """The other feet are supports, or contacts too."""
+    struck = tuple(f"{foot}:0,0,1" for foot in ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT") if foot not in feet)
+    task = {
+        "robot": "solo12", "normal": None, "contact": struck, "support": feet, "contact_pose": "position",
+        "objective": "sticking", "base": "level", "limit_margin": 0.5, "collision": False, "com": False,
+    }  # fmt: skip
+    problem = prepare(make_settings(task)).problem
+    solution = solve(problem, starts=2, jobs=1)
+    assert solution.certificate.holds() and solution.reduction > 0.2
 
 
 @pytest.mark.parametrize(("name", "frames"), [("solo12", ("FL_SHOULDER", "FR_SHOULDER")),
@@ -354,6 +428,7 @@ def test_a_resolved_problem_gives_the_same_again(tmp_path: Path) -> None:
         ({"contact": ("panda_hand:1,0,0", "panda_hand:2,0,0")}, ContactError, "given twice"),
         ({"contact": tuple(f"panda_link{k}:0,0,1" for k in range(1, 8))}, ContactError, "7 contacts"),
         ({"contact": ("panda_hand_tcp:0,0,1",), "bilateral": True}, ContactError, "one contact"),
+        ({"objective": "sticking", "bilateral": True}, ContactError, "sticking has no bounds on impulses"),
         ({"contact": ("panda_hand_tcp:0,0,1", "panda_hnd:0,0,1")}, ImpactPostureError, "panda_hand"),
         ({"contact": ("panda_hand_tcp:0,0,1", "panda_link4:0,0,0")}, SpecError, "with a direction"),
         ({"contact": ("panda_hand_tcp:0,0,1", "panda_link4:0,0,1:-2")}, SpecError, "impulse above zero"),

@@ -152,7 +152,9 @@ class Evaluation(JsonBlock):
         if self.contact_stability is not None:
             block |= {"footing": content["contact_stability"], "lifting_feet": content["standing"]}
         if self.impulses is not None:
-            block |= {"worst_impulses": content["impulses"], "coulomb_together": content["together"]}
+            block["worst_impulses"] = content["impulses"]
+        if self.contacts:
+            block["coulomb_together"] = content["together"]
             block["by_contact"] = [
                 {key: part[key] for key in _CONTACT if key in part} for part in content["contacts"]
             ]

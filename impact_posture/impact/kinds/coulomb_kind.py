@@ -73,7 +73,7 @@ class CoulombKind(ImpactKind):
         x = k.respond([impact_at(case, p)])
         value, R = k.product(x, x), in_world(case, k.tree, ca.SX.eye(3))
         r = -value * n - K @ (R.T @ k.adjoint_velocity(x) - value * Bn)
-        return value, k.size_gradient(x, impact_at(case, r))
+        return value, k.size_gradient(x, [impact_at(case, r)])
 
     def impulse(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX, ca.SX]:
         """Return the impulse ``p`` per unit approach speed, ``Bn``, and the matrix ``K`` with ``∂w = K ∂B (n − w)``.
@@ -94,7 +94,7 @@ class CoulombKind(ImpactKind):
         """
         case, size, d = self.case, ca.SX.sym(f"lam{label}"), ca.SX.sym(f"d{label}", 3)
         slip, inside = ca.SX.sym(f"kappa{label}"), ca.SX.sym(f"o{label}")
-        jump = unknown_jump(case, tree, impact_at(case, size * (n - case.contact.friction * d)), label)
+        jump = unknown_jump(case, tree, [impact_at(case, size * (n - case.contact.friction * d))], label)
         axes = in_world(case, tree, ca.SX.eye(3))
         moved = axes.T @ jump.contact_velocity
         along, out = ca.dot(n, moved), ca.dot(n, d)

@@ -47,7 +47,7 @@ class EnergyKind(FrictionlessKind, QuadraticKind):
         return -1 / (2 * form)
 
     def lift_direction(self, tree: Tree, n: ca.SX, label: str) -> UnknownJump:
-        return unknown_jump(self.case, tree, impact_at(self.case, n), label)
+        return unknown_jump(self.case, tree, [impact_at(self.case, n)], label)
 
     def lift_entry(self, world: ca.SX, first: UnknownJump, second: UnknownJump) -> ca.SX:
         return -ca.dot(world, second.contact_velocity)

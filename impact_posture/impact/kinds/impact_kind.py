@@ -41,6 +41,7 @@ class ImpactKind(ABC):
         symbol: Symbol of the scalar: H, V, S, C, E or m.
         units: Units of the value, as text.
         adds_up: Whether the impulse of each contact is given, so that the velocity jumps of several contacts add up.
+        simultaneous: Whether several contacts can arrive at the same time and at the same speed.
         kink: Text that states where the gradient is discontinuous, and which gradient is returned there; empty if
             the value is smooth.
         no_cone: Reason why the worst case over a cone of normals cannot be computed exactly.
@@ -52,6 +53,7 @@ class ImpactKind(ABC):
     symbol: ClassVar[str]
     units: ClassVar[str]
     adds_up: ClassVar[bool] = False
+    simultaneous: ClassVar[bool] = False
     kink: ClassVar[str] = ""
     no_cone: ClassVar[str] = "it is not a quadratic form of the normal"
     attempts: ClassVar[int] = 1
@@ -111,7 +113,7 @@ class FrictionlessKind(ImpactKind):
         The last unknown is ``λ``.
         """
         impulse = ca.SX.sym(f"lam{label}")
-        jump = unknown_jump(self.case, tree, impact_at(self.case, n * impulse), label)
+        jump = unknown_jump(self.case, tree, [impact_at(self.case, n * impulse)], label)
         return jump.with_impulse(impulse, ca.dot(in_world(self.case, tree, n), jump.contact_velocity) - 1)
 
     def jump(self, q: Array) -> tuple[Array, Array]:

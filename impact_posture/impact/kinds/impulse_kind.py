@@ -25,7 +25,7 @@ class ImpulseKind(QuadraticKind):
 
     def unknowns(self, tree: Tree, n: ca.SX, label: str = "") -> UnknownJump:
         """Return the velocity jump ``a`` with the equations ``M a − J_sᵀf − Jᵀn = 0``, ``J_s a + εf = 0``."""
-        return unknown_jump(self.case, tree, impact_at(self.case, n), label)
+        return unknown_jump(self.case, tree, [impact_at(self.case, n)], label)
 
     def jump(self, q: Array) -> tuple[Array, Array]:
         return self.oracle.quantities(q).jump, np.zeros(0)

@@ -22,6 +22,7 @@ class StickingKind(QuadraticKind):
     name, symbol = "sticking", "S"
     units = "jump² per (m/s)² of approach, no slip"
     unknown_impulse = True
+    simultaneous = True
 
     def unknowns(self, tree: Tree, n: ca.SX, label: str = "") -> UnknownJump:
         """Return the velocity jump ``a`` with ``M a − J_sᵀf − Jᵀs = 0``, ``J_s a + εf = 0``, ``J a = n``.
@@ -29,7 +30,7 @@ class StickingKind(QuadraticKind):
         The last three unknowns are the impulse ``s`` on the contact point.
         """
         impulse = ca.SX.sym(f"s{label}", 3)
-        jump = unknown_jump(self.case, tree, Wrench(self.case.point, impulse, ca.SX.zeros(3)), label)
+        jump = unknown_jump(self.case, tree, [Wrench(self.case.point, impulse, ca.SX.zeros(3))], label)
         return jump.with_impulse(impulse, jump.contact_velocity - in_world(self.case, tree, n))
 
     def jump(self, q: Array) -> tuple[Array, Array]:

@@ -99,24 +99,28 @@ class ImpactKernel:
         """Return ``a₁ᵀWa₂`` for the velocity jumps of two responses."""
         return ca.dot(first.a, self._weigh(second.a, second.velocities))
 
-    def size_gradient(self, jump: Response, r: Wrench | None = None) -> ca.SX:
+    def size_gradient(self, jump: Response, r: Sequence[Wrench] = ()) -> ca.SX:
         """Return the tangent gradient of ``aᵀWa`` for the velocity jump ``a`` of a response, shape (nv,).
 
-        If ``r`` is ``None``, the impulses that cause the jump are constant.  Otherwise a single impulse ``p(q)``
-        causes the jump, and ``∂pᵀJM⁻¹Wa = rᵀ∂B p`` with ``B = JM⁻¹Jᵀ``.
+        Without ``r``, the impulses that cause the jump are constant.  Otherwise impulses ``p(q)`` at the points of
+        ``r`` cause the jump, and ``∂pᵀJM⁻¹Wa = rᵀ∂B p`` with ``B = JM⁻¹Jᵀ``.
         """
-        if self.metric.kind == "kinetic" and not self._supported and r is None:
+        if self.metric.kind == "kinetic" and not self._supported and not r:
             return self.tree.pair_gradient(jump, jump)
-        adjoint = self.tree.respond(self._weigh(jump.a, jump.velocities), [] if r is None else self._on_all_limbs(r))
+        pushed = [part for impulse in r for part in self._on_all_limbs(impulse)]
+        adjoint = self.tree.respond(self._weigh(jump.a, jump.velocities), pushed)
         gradient = 2 * self.tree.pair_gradient(jump, adjoint)
         if self.metric.kind == "kinetic":
             gradient = gradient + self.tree.energy_gradient(jump.velocities)
         return gradient
 
-    def adjoint_velocity(self, x: Response) -> ca.SX:
-        """Return ``JM⁻¹Wa`` for the velocity jump ``a`` of a response, world axes, shape (3,)."""
+    def adjoint_velocity(self, x: Response, points: Sequence[PointOnLink] = ()) -> ca.SX:
+        """Return ``JM⁻¹Wa`` for the velocity jump ``a`` of a response, world axes, shape (3m,).
+
+        ``J`` belongs to the points, by default to the contact point.
+        """
         free = self.tree.respond(tau=self._weigh(x.a, x.velocities))
-        return self.tree.point_velocity(self.point, free.velocities)[:3]
+        return self.tree.point_velocities(points or [self.point], free.velocities)
 
     @cached_property
     def grad_G(self) -> ca.SX:
@@ -190,7 +194,7 @@ class ImpactKernel:
         """
         x = self._sticking
         r = -self._mobility_inverse @ self.adjoint_velocity(x)
-        gradient = self.size_gradient(x, self._force(r))
+        gradient = self.size_gradient(x, [self._force(r)])
         if self.case.in_contact_frame:
             gradient = gradient - 2 * self.tree.turning_gradient(self.point, self.world_normal, r)
         return gradient

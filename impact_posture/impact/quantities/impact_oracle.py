@@ -91,6 +91,10 @@ class ImpactOracle:
         """Return ``(M + J_sᵀJ_s/ε)⁻¹ τ`` for a vector ``tau`` or for each column of a matrix."""
         return self.respond(tau).a
 
+    def held_points(self, J: Array) -> StickingPoint:
+        """Return the system for m points whose velocities are given; ``J`` is their Jacobian, shape (3m, nv)."""
+        return StickingPoint.of(self._kkt, J, J @ self.solve(J.T), self.robot.projector)
+
     def weigh(self, a: Array) -> Array:
         """Return ``W a``; the entries of followers are zero, because their leaders determine them."""
         weighed = self.M @ a if self.metric.kind == "kinetic" else (self.metric.diagonal(self._nv) * a.T).T
@@ -169,7 +173,7 @@ class ImpactOracle:
         """
         self.at(q)
         _, n = self._normals(normal)
-        held = StickingPoint.of(self._kkt, self.J, self.J @ self.solve(self.J.T), self.robot.projector)
+        held = self.held_points(self.J)
         if not held.can_move(n):
             raise no_sticking()
         x, s = held.respond(velocity=n)

@@ -120,7 +120,7 @@ class UnknownJump:
         derivatives: Derivatives of ``residual − rest`` in closed form.
         compliance: Compliance ε of the supports, 1/kg.
         tree: The kinematic tree.  Each locked joint k has the equation ``a_k = 0``.
-        contact_velocity: Velocity jump ``J a`` of the contact point, world axes, shape (3,).
+        contact_velocity: Velocity jump ``J a`` of the m points with impulses, world axes, shape (3m,).
         couplings: Coupled joints.  A follower f has the equation ``a_f = ratio · a_l``, and its momentum is added to
             the equation of its leader l.
     """
@@ -170,8 +170,8 @@ class PlacedJump(NamedTuple):
     column: int
 
 
-def unknown_jump(case: ImpactCase, tree: Tree, impact: Wrench, label: str = "") -> UnknownJump:
-    """Return unknowns and equations for the velocity jump that the impulse ``impact`` causes at ``tree.q``."""
+def unknown_jump(case: ImpactCase, tree: Tree, impacts: Sequence[Wrench], label: str = "") -> UnknownJump:
+    """Return unknowns and equations for the velocity jump that the impulses ``impacts`` cause at ``tree.q``."""
     a = ca.SX.sym(f"a{label}", tree.nv)
     velocities = tree.velocities(a)
     feet = [Foot(point_on(case.robot, s.frame, s.offset), s.rows) for s in case.supports]
@@ -182,7 +182,7 @@ def unknown_jump(case: ImpactCase, tree: Tree, impact: Wrench, label: str = "") 
         wrenches.append(Wrench(foot.point, full[:3], full[3:], in_frame=True))
         held.append(tree.own_velocity(foot.point, velocities)[: foot.rows] + case.compliance * f_k)
         f = ca.vertcat(f, f_k)
-    pushed = -tree.generalized_force([impact])
+    pushed = -tree.generalized_force(impacts)
     momentum = tree.mass_times(a, velocities, less=wrenches) + pushed
     for follower, leader, ratio in case.robot.coupled_entries:
         for rows in (momentum, pushed):
@@ -199,7 +199,7 @@ def unknown_jump(case: ImpactCase, tree: Tree, impact: Wrench, label: str = "") 
         derivatives=JumpDerivatives(tree, feet),
         compliance=case.compliance,
         tree=tree,
-        contact_velocity=tree.point_velocity(impact.point, velocities)[:3],
+        contact_velocity=tree.point_velocities([impact.point for impact in impacts], velocities),
         couplings=case.robot.coupled_entries,
     )
 

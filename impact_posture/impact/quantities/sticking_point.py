@@ -28,7 +28,7 @@ class ImpulseResponse:
 
 @dataclass(frozen=True, eq=False)
 class StickingPoint:
-    """A contact point whose velocity is prescribed in the directions in which it can move.
+    """Contact points whose velocities are prescribed in the directions in which they can move.
 
     The system ``M a − J_sᵀf − Jᵀs = τ, J_s a + εf = 0, J a = v`` is solved as a whole.  A solution with
     ``(JM⁻¹Jᵀ)⁻¹`` would be less accurate, because the condition number of ``JM⁻¹Jᵀ`` would enter squared.
@@ -47,7 +47,7 @@ class StickingPoint:
         """
         values, vectors = np.linalg.eigh((mobility + mobility.T) / 2)
         kept = values > SINGULAR * max(float(values[-1]), 1e-300)
-        axes = np.eye(3) if kept.all() else vectors[:, kept]
+        axes = np.eye(len(J)) if kept.all() else vectors[:, kept]
         size, nv = len(kkt), J.shape[1]
         system = np.zeros((size + axes.shape[1],) * 2)
         system[:size, :size] = kkt

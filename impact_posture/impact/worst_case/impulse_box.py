@@ -66,13 +66,13 @@ class WorstImpulses:
 
 
 def check_contacts(contacts: Sequence[ImpactContact], kind: type[ImpactKind], *, bilateral: bool, cone: bool) -> None:
-    """Check that the worst case over a box of impulses is defined for the contacts.
+    """Check that an objective of the type ``kind`` is defined for the contacts.
 
     Raises:
-        ContactError: There are too many contacts, two contacts have the same point and normal, or a single contact is
-            bilateral.
-        MetricError: There are several contacts, and the objective type is not ``impulse`` or there is a cone of
-            normals.
+        ContactError: There are too many contacts, two contacts have the same point and normal, or ``bilateral`` has
+            no meaning.
+        MetricError: There are several contacts, and the objective type is neither ``impulse`` nor ``sticking``, or
+            there is a cone of normals.
     """
     if len(contacts) == 1:
         if bilateral:
@@ -85,11 +85,13 @@ def check_contacts(contacts: Sequence[ImpactContact], kind: type[ImpactKind], *,
     for i, place in enumerate(places):
         if place in places[:i]:
             raise ContactError(f"'{place[0]}' is given twice", where="contact", hint="remove one")
-    if not kind.adds_up:
+    if bilateral and not kind.adds_up:
+        raise ContactError(f"{kind.name} has no bounds on impulses", where="bilateral", hint="omit `bilateral`")
+    if not (kind.adds_up or kind.simultaneous):
         what = (
             f"{kind.name} assumes the approach speed of one contact, which does not determine the impulses of several"
         )
-        raise MetricError(what, where="objective", hint="choose impulse, or give one `contact`")
+        raise MetricError(what, where="objective", hint="choose impulse or sticking, or give one `contact`")
     if cone:
         what = "the worst case over a cone of normals is exact for one contact only"
         raise MetricError(what, where="normal_cone", hint="give one `contact`, or omit the cone")
@@ -176,7 +178,7 @@ class ImpulseBox:
 
     def lift(self, tree: Tree, parameters: ca.SX, scale: ca.SX) -> Lifted:
         case = self.oracle.case
-        jumps = [unknown_jump(case, tree, impact, f"{i}_") for i, impact in enumerate(self._impacts(parameters))]
+        jumps = [unknown_jump(case, tree, [impact], f"{i}_") for i, impact in enumerate(self._impacts(parameters))]
         K = _gram(len(jumps), lambda i, j: weighed(case.metric, jumps[i], jumps[j]))
         return worst_of(jumps, [ca.bilin(K, row, row) for row in map(ca.SX, self.corners)], scale)
 

@@ -170,9 +170,6 @@ class ControllerFactory:
         # With the controller ``path``, the end effector must stay at its start, so the optimal posture differs from
         # the optimal posture of ``posture``.  The plan of a strike assumes that the feet stay in place.
         kind, strikes = _KINDS.get(name, "impulse"), name == "strike" and self.setup.scenario.contacts is not None
-        if self.setup.scenario.falls:
-            # For several contacts, only bounds on the impulses are known.
-            kind, strikes = "impulse", False
         key = kind, name != "path", strikes
         if key not in self._offline:
             self._offline[key] = self.offline_of(
