@@ -108,4 +108,5 @@ def test_a_conflict_names_the_front_if_the_front_has_no_conflict(tmp_path: Path)
     done = run("optimize", *task, *more, cwd=tmp_path)
     hint = "put the contact point at the front of its links (--contact-point front), which is possible"
     refused(done, 3, "shoulder_link / surface at wrist_link", hint)
+    assert "only the hulls" not in done.stderr
     assert run("optimize", *task, *more, "--contact-point", "front", cwd=tmp_path).returncode == 0

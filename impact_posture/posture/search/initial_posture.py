@@ -113,8 +113,9 @@ def _initial_posture(
             )
         if overlap and problem.surroundings:
             hint += f"; {problem.surroundings.by_design}"
-            if not problem.surroundings.collisions(least.q):
-                hint += " (there only the hulls around the links touch, not the links)"
+        near = any(" / " in name for name in least.conflicts)
+        if near and problem.surroundings and not problem.surroundings.collisions(least.q):
+            hint += "; there only the hulls around the links touch, which are slightly larger than the links"
         raise Infeasible(least.conflicts, least.sizes, hint=hint + limits)
     projection = Projector(problem).project(least.q)
     if projection.violation > FEASIBLE:
