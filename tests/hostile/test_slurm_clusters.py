@@ -74,6 +74,8 @@ def controller(hostile_full: bool, monkeypatch: pytest.MonkeyPatch) -> Iterator[
     (folder / "key").chmod(0o400)
     with ExitStack() as stack:
         stack.callback(shutil.rmtree, folder, ignore_errors=True)
+        # Jobs survive their node.
+        stack.callback(kill_processes, "environ", f"SLURM_CONF={folder}")
         probes = [stack.enter_context(socket.socket()) for _ in range(2)]
         for probe in probes:
             probe.bind(("127.0.0.1", 0))
@@ -105,16 +107,13 @@ def waiting_jobs() -> list[str]:
     return slurm("squeue", "--noheader", "--array", "--states=PENDING", "--format=%i")
 
 
-def kill_processes(marker: str) -> None:
-    """Kill all processes of jobs that start within 5 s."""
-    end = time.monotonic() + 5
-    while time.monotonic() < end:
-        for entry in Path("/proc").iterdir():
-            with suppress(OSError, ValueError):
-                command = (entry / "cmdline").read_text()
-                if "submitit.core._submit" in command and marker in command:
-                    os.kill(int(entry.name), signal.SIGKILL)
-        time.sleep(0.05)
+def kill_processes(file: str, *words: str) -> None:
+    """Kill all processes whose ``cmdline`` or ``environ`` contains all of these words."""
+    for entry in Path("/proc").iterdir():
+        with suppress(OSError, ValueError):
+            text = (entry / file).read_text(errors="replace")
+            if all(word in text for word in words):
+                os.kill(int(entry.name), signal.SIGKILL)
 
 
 @pytest.mark.parametrize("disturbance", DISTURBANCES)
@@ -125,7 +124,10 @@ def test_a_slurm_cluster_is_disturbed(
         if "cancelled" in disturbance:
             slurm("scancel", *waiting_jobs()[:1] if "a job" in disturbance else ["--me"])
         elif "killed" in disturbance:
-            kill_processes(str(tmp_path))
+            end = time.monotonic() + 5
+            while time.monotonic() < end:
+                kill_processes("cmdline", "submitit.core._submit", str(tmp_path))
+                time.sleep(0.05)
         elif "stopped" in disturbance:
             os.kill(controller.pid, signal.SIGSTOP)
         if "Ctrl-C" in disturbance:
