@@ -195,8 +195,19 @@ def test_a_simultaneous_impact_along_conflicting_normals_is_refused() -> None:
     loaded = robot("panda")
     first, second = (ImpactContact("panda_hand_tcp", normal) for normal in ((0, 0, 1), (1, 0, 0)))
     objective = WorstCaseObjective(loaded, first, Metric(), "sticking", others=(second,))
-    with pytest.raises(MetricError, match="does not exist here"):
+    with pytest.raises(MetricError, match="does not exist here") as error:
         objective.value(loaded.posture())
+    assert "speed" not in error.value.hint, "this objective is for one contact"
+
+
+def test_a_simultaneous_impact_of_points_on_one_link_is_not_exported() -> None:
+    """Their distance is constant, so their mobility is singular at all postures, but the objective exists."""
+    loaded = robot("panda")
+    first, second = (ImpactContact(frame, (0, 0, 1)) for frame in ("panda_hand_tcp", "panda_hand"))
+    objective = WorstCaseObjective(loaded, first, Metric(), "sticking", others=(second,))
+    assert objective.value(loaded.posture()) > 0
+    with pytest.raises(MetricError, match="depend on each other"):
+        objective.gradient_fun()
 
 
 @pytest.mark.parametrize("feet", [(), ("HL_FOOT", "HR_FOOT")])

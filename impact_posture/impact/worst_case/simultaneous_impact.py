@@ -13,11 +13,12 @@ import casadi as ca
 import numpy as np
 
 from impact_posture.dynamics.tree import Tree, Wrench
+from impact_posture.errors import MetricError
 from impact_posture.impact.objective import Subgradients
 from impact_posture.impact.quantities.impact_kernel import ImpactKernel
 from impact_posture.impact.quantities.impact_oracle import ImpactOracle
 from impact_posture.impact.quantities.lifted_form import Guess, Lifted, in_world, unknown_jump, weighed
-from impact_posture.impact.quantities.sticking_point import ImpulseResponse, StickingPoint, no_sticking
+from impact_posture.impact.quantities.sticking_point import ImpulseResponse, StickingPoint
 from impact_posture.system.arrays import Array
 
 
@@ -43,11 +44,16 @@ class SimultaneousImpact:
         Raises:
             MetricError: The contact points cannot move along their normals at the same time.
         """
-        held = self.oracle.at(q).held_points(np.vstack([oracle.at(q).J for oracle in self.oracles]))
+        held = self._held(q)
         n = np.concatenate([oracle.n for oracle in self.oracles])
         if not held.can_move(n):
-            raise no_sticking()
+            what = "S does not exist here: the contact points cannot all move along their normals at the same time"
+            hint = "choose `objective` impulse, or other contacts, or another posture"
+            raise MetricError(what, where="objective sticking", hint=hint)
         return (held, *held.respond(velocity=n))
+
+    def _held(self, q: Array) -> StickingPoint:
+        return self.oracle.at(q).held_points(np.vstack([oracle.at(q).J for oracle in self.oracles]))
 
     def value(self, q: Array) -> float:
         _, x, _ = self.solve(q)
@@ -65,6 +71,17 @@ class SimultaneousImpact:
         return Subgradients(np.asarray(gradient)[None, :], np.zeros(1))
 
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
+        """Return value and gradient.
+
+        Raises:
+            MetricError: The velocities of the contact points depend on each other, for example on one rigid link.
+        """
+        if self._held(self.oracle.robot.posture()).outside.size:
+            what = "the velocities of the contact points depend on each other, so C code cannot compute S"
+            raise MetricError(
+                what, where="objective sticking", hint="give one contact per link, or leave out the C code"
+            )
+
         def pushed(impulses: ca.SX) -> list[Wrench]:
             parts = ca.vertsplit(impulses, 3)
             return [Wrench(o.point, part, ca.SX.zeros(3)) for o, part in zip(self.oracles, parts, strict=True)]
