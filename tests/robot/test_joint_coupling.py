@@ -247,7 +247,7 @@ def test_a_mimic_of_a_fixed_joint_is_held_and_a_continuous_joint_gets_one_angle(
 def test_the_online_controller_refuses_coupled_joints_that_it_would_move(tmp_path: Path) -> None:
     from impact_posture.tsid.actuators import Actuators
 
-    with pytest.raises(InputError, match="'right_joint' follows 'left_joint'"):
+    with pytest.raises(InputError, match="'right_joint' is coupled to 'left_joint'"):
         Actuators(load(tmp_path, *gripper()))
     Actuators(load(tmp_path, *gripper(), toml='[constraints]\nhold = ["left_joint"]'))
     Actuators(robot("panda"))
