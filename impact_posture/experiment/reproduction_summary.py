@@ -21,7 +21,7 @@ _COLUMNS = {
 }  # fmt: skip
 LEGEND = (
     f"The recovery columns show the same integral and peak {UNTIL_RECOVERY}. In a relaxed tick, limits made a task "
-    "give way. The status is `completed`, or how many runs completed. There is no reduction if a run did not "
+    "give way. The status is `completed`, or how many runs completed. The reduction is left out if a run did not "
     "complete."
 )
 

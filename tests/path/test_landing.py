@@ -171,9 +171,9 @@ def test_the_stop_after_the_landing_is_within_the_limits_of_legs_and_ground() ->
         load, carried = pin.rnea(model, data, q, v, a), J.T @ np.kron(np.eye(4), cone)
         limit = model.effortLimit[6:]
         torque, zero = carried[6:], np.zeros(carried.shape[1])
-        found = linprog(zero, np.vstack([-torque, torque]), np.append(limit - load[6:], limit + load[6:]),
-                        carried[:6], load[:6])  # fmt: skip
-        assert found.status == 0
+        balance = linprog(zero, np.vstack([-torque, torque]), np.append(limit - load[6:], limit + load[6:]),
+                          carried[:6], load[:6])  # fmt: skip
+        assert balance.status == 0
 
 
 def test_files_of_a_landing_are_read_back(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Jobs that Slurm loses or refuses, with commands that replace those of Slurm."""
+"""Jobs that Slurm loses or refuses, with stand-ins for the commands of Slurm."""
 
 from __future__ import annotations
 

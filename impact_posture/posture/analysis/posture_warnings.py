@@ -113,7 +113,7 @@ def _ground_warnings(prepared: Prepared, q: Array, posture: str) -> list[str]:
 def _origins(prepared: Prepared, numeric: Numeric) -> list[tuple[int, str, Array]]:
     """Return joint index, name and world origin of the links or joints that no collision constraint keeps apart.
 
-    The result contains the links without shapes.  If no link has a shape, or if there are no collision constraints,
+    The result contains the links without shapes.  If no link has a shape, or if collisions are not constrained,
     the result contains all joints.
     """
     robot, around = prepared.impact.robot, prepared.problem.surroundings

@@ -34,7 +34,7 @@ class LinkGeom(NamedTuple):
 def solid_links(robot: Robot) -> Iterator[tuple[int, str, pin.Frame, list[int]]]:
     """Yield the number, name, frame and solid geoms of each body with solid geoms in the MJCF of a robot.
 
-    Signed distance fields are left out.  Without an MJCF, there are no bodies.
+    Signed distance fields are left out.  A robot without an MJCF yields nothing.
     """
     if robot.mjcf is None:
         return
