@@ -63,7 +63,7 @@ MATERIALS = {"steel": (200e9, 0.28), "wood": (11.5e9, 0.3), "rubber": (0.03e9, 0
 
 # Default least distance between links that must not touch, m.
 CLEARANCE = 0.001
-# Default tilt, degrees, and shift, m, of the surface of a strike at which only the struck link may touch it.
+# Default tilt, degrees, and shift, m, of the surface of a strike at which only the struck links may touch it.
 SURFACE_SPREAD = (5.0, 0.005)
 # Default edge length of a square surface, m.  The square replaces the endless plane if a foot or a fixed base is
 # behind this plane.
@@ -287,7 +287,7 @@ class ProblemSettings(ImpactSettings):
         "plane|none|M", f"the plane, or {PATCH:g} where the robot stands behind it", parse=parse_number_or_name,
     )  # fmt: skip
     surface_spread: TiltAndShift = setting(
-        SURFACE_SPREAD, "With --strike, tilt and shift of the surface at which only the struck link touches it.",
+        SURFACE_SPREAD, "With --strike, tilt and shift of the surface at which only the struck links touch it.",
         LIMITS, "DEG M",
     )  # fmt: skip
     obstacles: tuple[Obstacle, ...] = ()

@@ -190,12 +190,7 @@ class ResolvedImpact:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Warnings about the robot and about this objective."""
-        # A single option `offset` cannot move several contact points.
-        alone = not self.objective.others
-        early = [
-            f"{touch.fact}: give {f'`offset` {touch.offset}, or ' if alone else ''}`contact_point` front"
-            for touch in self.early_touches(self.q)
-        ]
+        early = self.touch_warnings(self.q, "`contact_point` front")
         feet = sunken_feet(self.robot, self.supports, self.q)
         warnings = (*self.robot.warnings, *self.objective.warnings, *early, *feet)
         if not self.missing_support:
@@ -205,6 +200,13 @@ class ResolvedImpact:
     def early_touches(self, q: Array) -> tuple[EarlyTouch, ...]:
         """Return the links that touch a surface before the contact point at ``q``, shape (nq,)."""
         return early_touches(self.robot, self.objective.contacts, q, self.held)
+
+    def touch_warnings(self, q: Array, remedy: str) -> list[str]:
+        """Return a warning for each of :meth:`early_touches`, with a setting that prevents it (``remedy``)."""
+        # A single option `offset` cannot move several contact points.
+        alone = not self.objective.others
+        touches = self.early_touches(q)
+        return [f"{t.fact}: give {f'`offset` {t.offset}, or ' if alone else ''}{remedy}" for t in touches]
 
     def to_dict(self, q: Array | None = None) -> dict[str, object]:
         """Return the blocks of ``result.json`` that describe the impact: robot, contacts, supports, metric.

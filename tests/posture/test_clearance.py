@@ -23,6 +23,7 @@ from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import PointOnLink, Tree
 from impact_posture.errors import Infeasible, InputError
 from impact_posture.impact.impact_contact import point_on
+from impact_posture.impact.worst_case.worst_normal import cone_axes
 from impact_posture.posture.analysis.verdict_conditions import Circumstances, _surface
 from impact_posture.posture.constraints.clearance import Clearance, SpreadClearance
 from impact_posture.posture.constraints.pair_distances import PairDistances
@@ -322,20 +323,26 @@ def test_a_surface_lies_where_the_link_of_the_contact_reaches(name: str, normal:
 
 
 STRIKE = {"robot": "tilthex_arm", "normal": (-1, 0, 0), "speed": 0.3, "path": True, "strike": True}
+LANDING = {
+    "robot": "solo12", "contact": tuple(f"{leg}_FOOT:0,0,1" for leg in ("FL", "FR", "HL", "HR")), "support": (),
+    "contact_pose": "position", "objective": "sticking", "speed": 1, "path": True, "strike": True,
+}  # fmt: skip
 
 
 def _touched(problem: ConstrainedProblem, q: np.ndarray, tilt: float, shift: float, width: float) -> bool:
-    """Whether coal reports that a mesh of another link touches the surface, tilted to any of 16 sides and shifted."""
-    around, contact, model = problem.surroundings, problem.objective.contact, problem.robot.model
+    """Whether coal reports that a mesh of another link touches a surface, tilted to any of 16 sides and shifted."""
+    around, model = problem.surroundings, problem.robot.model
     assert around is not None
-    point, data = point_on(problem.robot, contact.frame, contact.offset), model.createData()
+    contacts, data = problem.objective.contacts, model.createData()
+    points = [point_on(problem.robot, contact.frame, contact.offset) for contact in contacts]
     pin.forwardKinematics(model, data, q)
-    n, home = np.array(contact.normal), (data.oMi[point.joint] * point.placement).translation
-    center = home - around.depth(contact) * n
     # The tip turns with the last link, so both may touch the surface.
-    shapes = [shape for shape in around.shapes.geometry.geometryObjects if shape.parentJoint != point.joint]
-    for heading in np.arange(16) * np.pi / 8:
-        across = np.array([0.0, np.cos(heading), np.sin(heading)])
+    struck = {point.joint for point in points}
+    shapes = [shape for shape in around.shapes.geometry.geometryObjects if shape.parentJoint not in struck]
+    for (contact, point), heading in product(zip(contacts, points, strict=True), np.arange(16) * np.pi / 8):
+        n, home = np.array(contact.normal), (data.oMi[point.joint] * point.placement).translation
+        center = home - around.depth(contact) * n
+        across = cone_axes(n)[:, 1:] @ [np.cos(heading), np.sin(heading)]
         normal = np.cos(np.deg2rad(tilt)) * n + np.sin(np.deg2rad(tilt)) * across
         place = coal.Transform3s()
         solid = coal.Halfspace(normal, float(normal @ center) + shift)
@@ -345,19 +352,27 @@ def _touched(problem: ConstrainedProblem, q: np.ndarray, tilt: float, shift: flo
             solid = coal.Box(width, width, width)
         for shape in shapes:
             at, request = data.oMi[shape.parentJoint] * shape.placement, coal.CollisionRequest()
+            shape.geometry.computeLocalAABB()
+            if normal @ (at.act(shape.geometry.aabb_center) - center) > shift + shape.geometry.aabb_radius:
+                continue
             there = coal.Transform3s(at.rotation, at.translation)
             if coal.collide(solid, place, shape.geometry, there, request, coal.CollisionResult()):
                 return True
     return False
 
 
-@pytest.mark.parametrize("surface", ["plane", 0.4])
-def test_a_posture_that_keeps_the_spread_touches_no_tilted_surface(surface: str | float) -> None:
-    problem = prepare(validate(ProblemSettings, {**STRIKE, "surface": surface}, "options")).problem
+@pytest.mark.parametrize(
+    ("strike", "surface", "scale", "count"),
+    [(STRIKE, "plane", 0.8, 60), (STRIKE, 0.4, 0.8, 60), (LANDING, "plane", 0.15, 20)],
+)
+def test_a_posture_that_keeps_the_spread_touches_no_tilted_surface(
+    strike: dict, surface: str | float, scale: float, count: int
+) -> None:
+    problem = prepare(validate(ProblemSettings, {**strike, "surface": surface}, "options")).problem
     (spread,) = [c for c in problem.constraints if isinstance(c, SpreadClearance)]
     rng, numeric, kept, broken = np.random.default_rng(0), Numeric(problem.robot.model), 0, 0
-    for _ in range(60):
-        q = _random(problem.robot, rng)
+    for _ in range(count):
+        q = pin.integrate(problem.robot.model, problem.given, rng.normal(size=problem.robot.nv) * scale)
         clear = spread.value(numeric.at(q)).min() > 0
         touched = _touched(problem, q, 5.0, 0.005, np.inf if surface == "plane" else float(surface))
         assert not (clear and touched)

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 import impact_posture as ip
+from impact_posture.config.problem_settings import ImpactSettings
+from impact_posture.impact.resolved_impact import resolve
 from tests.support.command import refused, run, succeed
 
 TASK = ("--normal", -1, 0, 0, "--starts", 2, "--jobs", 1, "--no-codegen", "--format", "png")
@@ -68,6 +70,9 @@ def test_several_contacts_keep_the_option_because_one_offset_cannot_hold_them(tm
     document = json.loads(done.stdout)
     assert all(np.linalg.norm(contact["offset"]) > 0.01 for contact in document["contacts"])
     assert not [line for line in document["warnings"] if "a flat surface touches" in line]
+    impact = resolve(ImpactSettings(robot="ur5", contact=tuple(contacts[1::2])))
+    lines = impact.touch_warnings(impact.q, "`contact_pose` full")
+    assert lines and all(line.endswith(": give `contact_pose` full") for line in lines)
 
 
 def test_front_and_offset_together_are_refused(tmp_path: Path) -> None:

@@ -30,10 +30,8 @@ def posture_warnings(
     loads = holding.violations() if holding else []
     held = [f"the robot cannot {verb} the {name} posture: {violation}" for violation in loads]
     if not prepared.impact.early_touches(initial):
-        held += [
-            f"in the {name} posture, {touch.fact}: give `offset` {touch.offset}, or `contact_pose` full"
-            for touch in prepared.impact.early_touches(q)
-        ]
+        touches = prepared.impact.touch_warnings(q, "`contact_pose` full")
+        held += [f"in the {name} posture, {touch}" for touch in touches]
     held += _balance_warnings(prepared, q, name) if holding is None else []
     return [*held, *_surface_warnings(prepared, initial, q, name), *_ground_warnings(prepared, q, name)]
 

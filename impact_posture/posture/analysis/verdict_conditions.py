@@ -52,7 +52,7 @@ class Circumstances:
         moved: Distance from the given to the initial posture, rad mixed with m.
         no_path: Why no path leads to the optimum, and where the path ends; empty if it ends at the optimum.
         strikes: Whether ``attainable`` is the speed at the end of a computed path that strikes the surface.
-        spread: Tilt, degrees, and shift, m, up to which only the struck link touches the surface, if more was
+        spread: Tilt, degrees, and shift, m, up to which only the struck links touch the surface, if more was
             required; otherwise ``None``.
     """
 

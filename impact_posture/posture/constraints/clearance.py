@@ -192,6 +192,6 @@ class Clearance(Constraint):
 
 
 class SpreadClearance(Clearance):
-    """Clearance to the surface of a strike in all its places within the stated tilt and shift."""
+    """Clearance to the surfaces of a strike in all their places within the stated tilt and shift."""
 
     at_impact = True

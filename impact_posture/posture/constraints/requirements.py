@@ -50,7 +50,7 @@ class Requirements:
         clearance: Least distance between links, surface, ground and obstacles if ``collision`` is set, m.
         surface: Shape of the surface: ``plane``, ``none``, or the edge length of a square patch, m; if ``None``, the
             plane or a patch is chosen for the robot.
-        surface_spread: Tilt, degrees, and shift, m, of the surface at which only the struck link may touch it, if
+        surface_spread: Tilt, degrees, and shift, m, of the surface at which only the struck links may touch it, if
             ``strike`` is set.  If no posture allows this, the requirement is dropped.
         limit_margin: Least distance of the joint positions from their limits, rad or m.
         regularization: Weight of the squared distance from the initial posture, relative to the initial objective.

@@ -137,32 +137,37 @@ class Surroundings:
         hull = SweptHull(name, name, point.joint, corners, 0.0)
         self._walls.append(_Wall(ConvexBody(name, hull, point, turns), exempt))
 
-    def clearance_of_spread(self, contact: ImpactContact, tilt: float, shift: float) -> SpreadClearance | None:
-        """Return the clearance to the surface of a contact that may be tilted and shifted.
+    def clearance_of_spread(self, tilt: float, shift: float) -> SpreadClearance | None:
+        """Return the clearance to the surfaces of all contacts, each of which may be tilted and shifted.
 
-        A point whose distance from the contact point is ``r`` along the surface has at least the distance ``clearance
-        + shift + r tan(tilt)`` from the surface, to first order.  The links that may touch the surface are excepted.
-        ``tilt`` is in degrees, and ``shift`` in m.  The surface is tilted towards :data:`_TILTED` sides, by slightly
-        more than ``tilt``, so that these surfaces contain all surfaces between them.  Return ``None`` if the contact
-        has no surface, or no other link.
+        A point whose distance from a contact point is ``r`` along its surface has at least the distance ``clearance +
+        shift + r tan(tilt)`` from this surface, to first order.  The struck links and the links that may touch the
+        surface are excepted.  ``tilt`` is in degrees, and ``shift`` in m.  A surface is tilted about its contact
+        point, towards :data:`_TILTED` sides, by slightly more than ``tilt``, so that these surfaces contain all
+        surfaces between them.  Return ``None`` if no contact has a surface, or if there are no other links.
         """
-        name = f"surface at {contact.frame}"
-        wall = next((wall for wall in self._walls if wall.body.name == name), None)
-        if wall is None or not (tilt or shift):
+        if not (self._depths and (tilt or shift)):
             return None
-        n, links = np.array(contact.normal), [b for b in self._bodies if b.point.joint not in wall.exempt]
-        # The surface turns about the point of the surface that is nearest to the contact point.
-        center, steep = -self.depth(contact) * n, np.arctan(np.tan(np.deg2rad(tilt)) / np.cos(np.pi / _TILTED))
-        pairs, name = list[SeparatingPlane](), f"{name}, tilted by {tilt:g}°"
-        for heading in 2 * np.pi * np.arange(_TILTED if tilt else 1) / _TILTED:
-            tilted = cone_axes(n) @ [np.cos(steep), np.sin(steep) * np.cos(heading), np.sin(steep) * np.sin(heading)]
-            side, hull = replace(wall.body, name=name), wall.body.hull
-            if hull is None:
-                side = replace(side, normal=tilted, offset=float(center @ tilted))
-            else:
-                turn = pin.Quaternion.FromTwoVectors(n, tilted).matrix()
-                side = replace(side, hull=replace(hull, vertices=(hull.vertices - center) @ turn.T + center))
-            pairs += [SeparatingPlane(link, side, self._clearance + shift) for link in links]
+        steep = np.arctan(np.tan(np.deg2rad(tilt)) / np.cos(np.pi / _TILTED))
+        struck = self._rigid(point_on(self.robot, contact.frame).joint for contact in self._depths)
+        walls, pairs = {wall.body.name: wall for wall in self._walls}, list[SeparatingPlane]()
+        for contact, depth in self._depths.items():
+            wall, n = walls[f"surface at {contact.frame}"], np.array(contact.normal)
+            links = [b for b in self._bodies if b.point.joint not in wall.exempt | struck]
+            # The surface turns about the point of the surface that is nearest to the contact point.
+            center, name = -depth * n, f"{wall.body.name}, tilted by {tilt:g}°"
+            for heading in 2 * np.pi * np.arange(_TILTED if tilt else 1) / _TILTED:
+                across = np.array([np.cos(heading), np.sin(heading)])
+                tilted = cone_axes(n) @ [np.cos(steep), *(np.sin(steep) * across)]
+                side, hull = replace(wall.body, name=name), wall.body.hull
+                if hull is None:
+                    side = replace(side, normal=tilted, offset=float(center @ tilted))
+                else:
+                    turn = pin.Quaternion.FromTwoVectors(n, tilted).matrix()
+                    side = replace(side, hull=replace(hull, vertices=(hull.vertices - center) @ turn.T + center))
+                pairs += [SeparatingPlane(link, side, self._clearance + shift) for link in links]
+        frames = listed([contact.frame for contact in self._depths], 4)
+        name = f"surface at {frames}, tilted by {tilt:g}°"
         text = f"links at least {1e3 * (self._clearance + shift):g} mm from the {name}"
         return SpreadClearance(name, pairs, text) if pairs else None
 

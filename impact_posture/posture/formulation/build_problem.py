@@ -97,8 +97,8 @@ def build_problem(robot: Robot, objective: Objective, given: Array, requirements
     if requirements.collision:
         around = _surroundings(objective, numeric, requirements, list(struck.values()))
         constraints += [*around.nested, *around.constraints]
-        if requirements.strike and len(objective.contacts) == 1:
-            spread = around.clearance_of_spread(*objective.contacts, *requirements.surface_spread)
+        if requirements.strike:
+            spread = around.clearance_of_spread(*requirements.surface_spread)
             constraints += [] if spread is None else [spread]
         notes += around.notes
     constraints += [constraint for case in loads.cases for constraint in case.constraints()]

@@ -41,7 +41,7 @@ _BISECTIONS = 8
 def initial_posture(problem: ConstrainedProblem, seed: int) -> tuple[ConstrainedProblem, Array, ProgramRows]:
     """Return the problem, a posture from which the search begins, and the rows of the program.
 
-    If no posture keeps clear of the surface of a strike in all its places (:class:`SpreadClearance`), the returned
+    If no posture keeps clear of the surfaces of a strike in all its places (:class:`SpreadClearance`), the returned
     problem requires only a share of the tilt and shift.
 
     Raises:
@@ -59,15 +59,15 @@ def initial_posture(problem: ConstrainedProblem, seed: int) -> tuple[Constrained
 
 
 def _with_spreads(problem: ConstrainedProblem) -> Iterator[ConstrainedProblem]:
-    """Yield the problem with smaller and smaller tilts and shifts of the surface of a strike, the last without."""
+    """Yield the problem with smaller and smaller tilts and shifts of the surfaces of a strike, the last without."""
     spread = next((c for c in problem.constraints if isinstance(c, SpreadClearance)), None)
     if spread is None or problem.surroundings is None:
         yield problem
         return
-    place, contact = problem.constraints.index(spread), problem.objective.contacts[0]
+    place = problem.constraints.index(spread)
     for share in _SHARES:
         tilt, shift = (share * value for value in problem.requirements.surface_spread)
-        smaller = problem.surroundings.clearance_of_spread(contact, tilt, shift)
+        smaller = problem.surroundings.clearance_of_spread(tilt, shift)
         constraints, rows = list(problem.constraints), list(problem.rows)
         constraints[place : place + 1] = [] if smaller is None else [smaller]
         if smaller is None:
