@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from impact_posture.robot.robot_spec import Support as Support
 
 
-# Names of modules → where they are.
+# Public name of a module → its path in the package.
 _MODULES = {
     "gpu": "frameworks.gpu",
     "jax": "frameworks.jax_metric",

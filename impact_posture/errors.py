@@ -29,7 +29,8 @@ def printable(text: str, *, keep: str = "", longest: int = 0) -> str:
     Args:
         text: Any text.
         keep: Characters that are not replaced, such as line breaks.
-        longest: Largest length of the result.  The middle of a longer text is left out; 0 sets no limit.
+        longest: Largest number of characters of the result.  The middle of a longer text is left out; 0 sets no
+            limit.
     """
     if longest and len(text) > longest:
         half = longest // 2
@@ -273,7 +274,7 @@ class ManifestMismatch(InputError):
 
 
 def remedy(error: Exception, hint: str) -> str:
-    """Return the hint for a system error.  The given ``hint`` is for errors that concern the file."""
+    """Return the hint for a system error.  ``hint`` is the hint for errors that concern the file."""
     number = getattr(error, "errno", None)
     return "raise the limit of open files (ulimit -n)" if number in (errno.EMFILE, errno.ENFILE) else hint
 
@@ -331,7 +332,7 @@ class WorkerDied(ImpactPostureError):
     """
 
     def __init__(self, option: str = "jobs", reason: str = "") -> None:
-        what, hint = "a worker process was killed", f"give it more memory, or work in one process: `{option}` 1"
+        what, hint = "a worker process was killed", f"provide more memory, or work in one process: `{option}` 1"
         if reason:
             what, hint = f"the workers were lost ({reason})", "check them, and run the command again to continue"
         super().__init__(what, where=option, hint=hint)
@@ -345,7 +346,7 @@ class SimulationDiverged(ImpactPostureError):
     def __init__(self, time: float, *, where: str = "simulation") -> None:
         self.time = time
         super().__init__(
-            f"the state ran away at t = {time:.4g} s",
+            f"the state diverged at t = {time:.4g} s",
             where=where,
             hint="lower the time step or the controller's gains, or soften the contact",
         )

@@ -54,9 +54,9 @@ class ImpactObjective(WorstCaseObjective):
             :class:`~impact_posture.impact.metric.Metric`.
         kind: Minimized quantity: ``impulse`` (λ̄²H), ``speed`` (V), ``sticking`` (S), ``coulomb`` (C), ``energy`` (E)
             or ``effective-mass`` (m).  λ̄ is the largest impulse of the contact, and ``docs/notation.md`` defines the
-            other symbols.  ``None`` selects ``impulse``.  If the contact states its friction, ``None`` instead
-            selects the quantity that ``--objective auto`` selects on the command line.  The same holds in a
-            :class:`PostureProblem` that states the speed or the elasticity of the contact.
+            other symbols.  ``None`` selects ``impulse``.  If the contact states its friction, or the
+            :class:`PostureProblem` the speed or the elasticity, ``None`` instead selects the quantity that
+            ``--objective auto`` selects on the command line.
         supports: Feet that stay in place during the impact, as ``FRAME[:point|surface]``; ``None`` selects the feet
             of robot.toml, ``()`` selects no feet.
         compliance: Compliance ε of the supports, 1/kg; 0 selects 1e-4 divided by the mass of the robot.
@@ -159,7 +159,7 @@ class ImpactObjective(WorstCaseObjective):
 
         Args:
             out: The folder.
-            build: Whether to build and check the library, if a C compiler is installed.
+            build: Whether to compile the code and check the library, if a C compiler is installed.
             options: Options of :func:`write_export`: ``prefix``, ``posture``, ``single``, ``portable``, ``cuda`` and
                 ``force``.
         """

@@ -211,7 +211,7 @@ class PostureResult:
             formats: File formats of the pictures: ``png``, ``svg``, ``pdf``.
             report: Whether to write ``report.html``, a page with the result and the robot in 3-D.
             meshes: Whether to embed the meshes of the user's own URDF in ``report.html``.  Everyone who opens the
-                page gets them.
+                page then receives the meshes.
             jobs: Number of parallel processes that draw and compile.
             progress: Function that is called after each file, with the number of finished files and the number of all
                 files.
@@ -256,7 +256,7 @@ class PostureResult:
 
     @checked
     def export(self, out: str | Path, *, build: bool = True, **options: Any) -> Export:
-        """Write C code like :meth:`ImpactObjective.export`, with :attr:`answer` as a constant."""
+        """Write C code as :meth:`ImpactObjective.export` does; the code contains the posture :attr:`answer`."""
         from impact_posture.codegen.export import write_export
 
         objective = self.problem.problem.impact

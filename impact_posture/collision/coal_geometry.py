@@ -56,7 +56,7 @@ def load_geometry(robot: Robot, described: list[LinkShape]) -> Geometry:
             kept.append(shape)
             if not loaded[shape.key].exact:
                 why = f"the parts of {shape.mesh} cannot be separated; export it as one part"
-                warnings.append(one_line(f"shape {shape.name} is its convex hull: {why}"))
+                warnings.append(one_line(f"shape {shape.name} is replaced by its convex hull: {why}"))
         except UnusableShape as fault:
             warnings.append(left_out(shape.name, fault))
     objects = _placed(model, kept, solids, turned=False)

@@ -53,8 +53,8 @@ class Silhouette:
         link: Link of the shape.
         corners: Corners in the axes of the joint that carries the link, shape (k, 3), m.
         ball: Radius of the balls, m.
-        disk: Vector along the axis of the disks, in the axes of the joint, shape (3,), m.  Its length is the radius
-            of the disks.
+        disk: Vector along the axis of the disks, with the length of their radius, in the axes of the joint, shape
+            (3,), m.
     """
 
     link: str

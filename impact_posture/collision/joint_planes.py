@@ -77,7 +77,7 @@ def joint_planes(
 
 
 def _cut_off(hit: NDArray[np.bool_], positions: Array, step: float) -> tuple[Array, Array] | None:
-    """Return normals, shape (k, m), and bounds of planes that remove all positions ``hit``, but not the origin.
+    """Return normals, shape (k, m), and bounds of planes that separate all positions ``hit`` from the origin.
 
     ``positions``, shape (n, m), are relative to the default posture.  ``positions`` and ``step`` are divided by half
     the joint ranges.
@@ -87,7 +87,7 @@ def _cut_off(hit: NDArray[np.bool_], positions: Array, step: float) -> tuple[Arr
     # Directions along each axis, and at equal angles to several axes.
     signs = np.array([signs for signs in product((-1, 0, 1), repeat=positions.shape[1]) if any(signs)], dtype=float)
     directions = signs / np.linalg.norm(signs, axis=1, keepdims=True)
-    # Extent of the cells around a position along each direction.
+    # Extent along each direction of the grid cell around a position.
     cells = step * np.abs(directions).sum(axis=1)
     normals, bounds = [np.zeros((0, positions.shape[1]))], [np.zeros(0)]
     while len(left):

@@ -22,8 +22,8 @@ from impact_posture.system.text_files import open_regular, read_bytes
 
 # Largest mesh file, bytes, because loading a binary STL takes about 20 times its size in memory.
 LARGEST_FILE = 100_000_000
-# Longest processor time for reading a mesh: ``_SECONDS``, plus 1 s for each ``_BYTES_PER_SECOND`` bytes.  The largest
-# binary STL takes 16 s.
+# Longest processor time for reading a mesh: ``_SECONDS``, plus 1 s for each ``_BYTES_PER_SECOND`` bytes.  Reading the
+# largest allowed binary STL takes 16 s.
 _SECONDS, _BYTES_PER_SECOND = 5.0, 2_500_000
 # Least time, s, for reading a mesh after other meshes of the robot took too long.
 _LEAST_SECONDS = 0.5
@@ -68,7 +68,7 @@ class Mesh(NamedTuple):
 
 
 def read_meshes(paths: Iterable[Path]) -> None:
-    """Read mesh files that :func:`read_mesh` returns later.  One process reads them all, which saves time."""
+    """Read mesh files in advance for :func:`read_mesh`.  A single process reads all files, which saves time."""
     stamps = [stamp for stamp in dict.fromkeys(map(_stamp, paths)) if stamp not in _READ]
     for stamp in list(_READ)[: max(0, len(_READ) + len(stamps) - _MOST_MESHES)]:
         del _READ[stamp]
@@ -166,7 +166,7 @@ def _root_transform(path: Path) -> Array | None:
         return None
     data = read_bytes(path)
     end = 20 + int.from_bytes(data[12:16], "little") if data.startswith(b"glTF") else 0
-    if end > len(data):  # The mesh library would allocate the stated length.
+    if end > len(data):  # The mesh library would allocate as many bytes as the file states.
         raise ValueError("the file ends too early")
     content = json.loads(data[20:end] if end else data)
     roots = [

@@ -56,7 +56,8 @@ class MjcfShape(LinkShape):
 def mjcf_shapes(model: Any, first: str) -> LinkShapes:
     """Return the solid geoms of an ``MjModel``; with ``first="visual"``, the visual geoms of bodies that have any.
 
-    The world of a fixed robot has the shapes of its base.  The surroundings of a floating robot are not its shapes.
+    For a fixed robot, geoms of the MuJoCo world belong to the base.  For a floating robot, they belong to the
+    surroundings and are left out.
     """
     read = LinkShapes([], [], [])
     for b, solid in solid_geoms(model):
@@ -85,7 +86,7 @@ def disabled_bodies(model: Any) -> set[frozenset[str]]:
 
 
 def excluded_pairs(model: Any, bodies: Iterable[int]) -> set[tuple[int, int]]:
-    """Return the excluded pairs of bodies, and the pairs of ``bodies`` in one rigid group or in consecutive groups.
+    """Return the pairs of bodies that the MJCF excludes, or that are in the same or in consecutive rigid groups.
 
     A rigid group is a body with joints and the bodies without joints that it carries.
     """

@@ -52,8 +52,8 @@ class FittedShapes:
 class RobotShapes(FittedShapes):
     """Collision shapes and their robot; the shapes of the URDF are loaded on demand.
 
-    ``without_shapes`` names the links for which the URDF describes only unusable shapes.  It also names the first
-    link of each joint that moves a mass but no shape.
+    ``without_shapes`` contains the names of links for which the URDF describes only unusable shapes.  It also
+    contains the first link of each joint that moves a mass but no shape.
     """
 
     robot: Robot
@@ -98,7 +98,7 @@ class _Source:
         return tuple(bare)
 
     def all_warnings(self, used: Collection[str], warnings: Iterable[str]) -> tuple[str, ...]:
-        """Return all warnings; ``warnings`` come from loading the shapes of the links ``used``."""
+        """Return all warnings about shapes; ``warnings`` come from loading the shapes of the links ``used``."""
         words, bare = [] if used else [NO_SHAPES], self.without_shapes(used)
         if used and bare:
             named = f"links without shapes: {listed(bare)}"
@@ -113,7 +113,7 @@ def _source(robot: Robot) -> _Source:
 
 
 def shape_warnings(robot: Robot) -> tuple[str, ...]:
-    """Return the warnings of :func:`load_shapes` without computing hulls, which takes longer.
+    """Return the warnings of :func:`load_shapes`, but do not compute hulls, because this would take longer.
 
     Raises:
         UrdfError: The same errors as in :func:`load_shapes`.

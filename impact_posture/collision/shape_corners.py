@@ -2,8 +2,8 @@
 
 A node of a mesh file may have several parts, one for each material.  coal 3.0 stacks the corners of all parts, but
 numbers the triangles of every part from the first corner of the node.  The triangles of a part begin with the corners
-0, 1 and 2 of the part and use all its corners.  Therefore, this module can detect the parts and check the result.  If
-the check fails, the convex hull of the corners, which contains the mesh, replaces the mesh.
+0, 1 and 2 of the part and use all its corners.  From this order, the module detects the parts and checks the result.
+If the check fails, the convex hull of the corners, which contains the mesh, replaces the mesh.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from impact_posture.system.arrays import Array
 
 # Number of corners of the polygon around a circle.  The polygon is 0.5 % larger than the circle.
 _SIDES = 32
-# Number of points around a ball.  The convex hull of the points is 2 % larger than the ball.
+# Number of points whose convex hull replaces a ball.  The hull is 2 % larger than the ball.
 _BALL = 200
 
 Triangles = NDArray[np.int_]
@@ -73,9 +73,9 @@ def renumbered(count: int, faces: Triangles) -> Triangles | None:
 
 
 def _shifted(faces: Triangles, across: bool = False) -> Triangles:
-    """Return the triangles with corner numbers that continue from part to part.
+    """Number the corners of all triangles from the first corner of the file.
 
-    A new part begins where the first corners of the node occur again; ``across`` also detects new nodes.
+    A new part begins where a triangle uses the first corners of the node again; ``across`` also detects new nodes.
     """
     starts, shifts, begin = [0], [0], 0
     for k in np.flatnonzero((np.diff(faces, axis=1) == 1).all(axis=1))[1:]:
@@ -106,7 +106,7 @@ def shape_points(shape: Any) -> Array:
 
 
 def surface_of(shape: Any) -> tuple[Array, Triangles]:
-    """Return corners, shape (k, 3), m, and triangles, shape (n, 3), of a mesh or of the hull around another shape."""
+    """Return corners, shape (k, 3), m, and triangles, shape (n, 3), of a mesh, or of the hull around a shape."""
     points = shape_points(shape)
     return (points, mesh_triangles(shape)) if isinstance(shape, coal.BVHModelBase) else hull_surface(points)
 

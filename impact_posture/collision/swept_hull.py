@@ -176,15 +176,15 @@ def fit_hull(points: Array) -> Fit:
     """Fit a sphere-swept convex hull that contains points, shape (n, 3), m.
 
     Candidates are the corners of the convex hull of the points.  Each step adds the candidate farthest from the
-    fitted hull.  The steps end if all candidates are within :data:`_TOLERANCE` of the fitted hull, or if it has 40
-    corners.  The sweep radius is the largest distance of a point from the fitted hull.
+    fitted hull, until all candidates are within :data:`_TOLERANCE` of the fitted hull, or the hull has 40 corners.
+    The sweep radius is the largest distance of a point from the fitted hull.
     """
     corners = hull_corners(points)
     candidates = corners[:: -(-len(corners) // _MOST_CANDIDATES)]
     axes = np.linalg.eigh(np.cov(candidates.T))[1] if len(candidates) > 1 else np.eye(3)
     chosen = list(dict.fromkeys(int(np.argmax(candidates @ axis)) for axis in np.hstack([axes, -axes]).T))
-    # A growing hull only reduces the distances of the points.  Old distances are therefore upper bounds, and only the
-    # largest are computed again.
+    # When the hull grows, the distances of the points from the hull can only decrease.  Earlier distances are
+    # therefore upper bounds, and only the largest are computed again.
     bounds = np.linalg.norm(candidates[:, None] - candidates[chosen], axis=2).min(axis=1)
     queue = [(-bound, k) for k, bound in enumerate(bounds.tolist())]
     heapify(queue)

@@ -20,10 +20,10 @@ from impact_posture.system.text_files import read_text
 
 _Value = TypeVar("_Value", bound=Hashable)
 
-# Larger cache files are not read, bytes.  The largest file for a robot of this package has a third of this size.
+# Largest cache file that is read, bytes.  The largest file for a robot of this package has a third of this size.
 _LONGEST = 10_000_000
 
-# For each running ``make``, whether its value may be stored.
+# Whether values may be stored, for each call of ``make`` that is running.
 _STORABLE: list[bool] = []
 
 

@@ -15,7 +15,7 @@ from impact_posture.config.text_parsers import parse_contact
 from impact_posture.errors import ImpactPostureError, not_one_of
 
 _INFINITE = float("inf")
-# Largest length, m.  With a greater length, the solver does not return.
+# Largest length, m.  If an input is a greater length, the solver does not return.
 _FARTHEST = 1e100
 # Largest mass, kg.  With a greater mass, the mass matrix is singular in double precision.
 _HEAVIEST = 1e12

@@ -100,11 +100,11 @@ class LoadOptions(StrictTable):
         lock_massless: Whether all joints that move no mass also become rigid.
         root: ``free-flyer`` puts the robot on a floating base, ``fixed`` welds it to the world.
         armature: ``"none"``, the path of a TOML file, or a value for each named joint, kg·m² (kg if prismatic).
-            ``None`` selects the values of robot.toml, or else the rotor data of the SRDF, or else zero.
+            ``None`` selects the armature in robot.toml, or else in the rotor data of the SRDF, or else zero.
         config: Path of a robot.toml that is read instead of the robot.toml beside the URDF.
         srdf: SRDF file: a path, or ``example-robot-data:<path below robots/>``.
-        package_dir: Folders in which ``package://`` paths are searched.  Only the meshes of
-            collision shapes and pictures need these folders.
+        package_dir: Folders in which ``package://`` paths are searched.  Only the meshes of collision shapes and
+            pictures need these folders.
         xacro_arg: Argument of a xacro file → its value; ``None`` selects the defaults of the file.
         mounting: Displacement of each named joint from its place in the URDF, m, in the axes of the parent joint.
     """

@@ -8,7 +8,7 @@ from typing import Any
 
 
 class Unstated(float):
-    """Default number of a setting.  A number that the user gives has another type, even with the same value."""
+    """Default number of a setting.  A number from the user is a plain ``float``, even if it equals the default."""
 
 
 def stated(value: float | str | None) -> bool:

@@ -30,7 +30,8 @@ def validate(cls: type[_Table], data: object, where: str) -> _Table:
     """Convert a table to a dataclass.  The error describes the first fault in one line.
 
     Args:
-        cls: Dataclass, possibly with nested dataclasses.  Its ``__pydantic_config__`` may forbid unknown keys.
+        cls: Dataclass, possibly with nested dataclasses.  The ``__pydantic_config__`` of the dataclass may forbid
+            unknown keys.
         data: Table, for example from :func:`read_toml`.
         where: Name of the file, for error messages.
 

@@ -77,7 +77,7 @@ def _each_once(pairs: Iterable[tuple[str, _Value]], where: str) -> dict[str, _Va
 
 
 def finite_numbers(text: str, count: int = 1) -> list[float]:
-    """Read ``count`` finite numbers between spaces; return an empty list for any other text."""
+    """Read ``count`` finite numbers separated by spaces; return an empty list for any other text."""
     try:
         numbers = [float(word) for word in text.split()]
     except ValueError:

@@ -26,8 +26,8 @@ from impact_posture.robot.urdf import EXAMPLE_PREFIX, example_robot_data
 from impact_posture.system.escape import toml
 from impact_posture.system.output_folder import check_name
 
-# Pairs of a number and a contact pose.  The draft guesses the first pose whose number is at most the number of joints
-# that lead to the contact frame.  This pose leaves some freedom of motion.
+# Contact poses, each with the least number of joints between base and contact frame for which the draft guesses the
+# pose.  The first pose that fits is guessed, which leaves some freedom of motion.
 _POSES = ((7, "full"), (6, "aligned"), (4, "position"), (0, "free"))
 # Largest speed of a propeller in a draft, Hz.
 _SPEED = 100.0
@@ -194,7 +194,7 @@ def _contact(draft: Draft, robot: Robot, feet: Sequence[str], ends: Sequence[str
     if frame == base:
         pose, why = "free", "a push at the base"
     else:
-        # A floating base adds degrees of freedom.
+        # A floating base counts as four more joints.
         count = len(joints) + (4 if robot.floating else 0)
         pose, why = next(p for least, p in _POSES if count >= least), f"{len(joints)} joints lead to it"
     draft.lines += ["", "[contact]"]
@@ -209,7 +209,7 @@ def _contact(draft: Draft, robot: Robot, feet: Sequence[str], ends: Sequence[str
 
 def _supports(draft: Draft, robot: Robot, feet: Sequence[Support]) -> None:
     if robot.floating and not feet:
-        text = "No feet were found, so the robot is assumed to float. If it stands, list each foot:"
+        text = "No feet were found, so the robot is assumed to float. If the robot stands, list each foot:"
         draft.note(text, "[[supports]]", 'frame = "FOOT"', 'kind = "point"')
     frames = guess.upright_frames(robot).oMf
     placements = [frames[robot.frame_id(foot.frame)] for foot in feet]

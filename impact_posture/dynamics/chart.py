@@ -40,8 +40,9 @@ class Chart:
 
     def __init__(self, model: pin.Model) -> None:
         self.slots: list[JointSlot] = []
-        # Both lists contain pairs of an index in q and an index in x.  The values of ``copied`` are equal in q and x.
-        # ``angles`` pairs the cosine of an angle in q with the angle in x; the sine follows the cosine.
+        # ``copied`` and ``angles`` contain pairs of an index in q and an index in x.  The values of ``copied`` are
+        # equal in q and x.  ``angles`` pairs the cosine of an angle in q with the angle in x; the sine follows the
+        # cosine.
         copied: list[tuple[int, int]] = []
         angles: list[tuple[int, int]] = []
         start = 0

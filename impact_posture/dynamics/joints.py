@@ -51,7 +51,7 @@ def joint_kind(joint: pin.JointModel, name: str) -> JointKind:
     if family not in JOINT_ENTRIES:
         hint = "lock it (`lock`) or model it by revolute and prismatic joints"
         raise UnsupportedJoint(f"joint '{name}' is of type {family}", where="symbolic dynamics", hint=hint)
-    # S does not depend on the configuration, so any configuration can be used here.
+    # The motion subspace S does not depend on the configuration, so any configuration can be used here.
     data = joint.createData()
     joint.calc(data, np.full(joint.idx_q + joint.nq, 0.5))
     subspace = np.array(data.S, dtype=float).reshape(6, -1)

@@ -4,8 +4,8 @@ The left sides of the equations of a velocity jump ``a`` with foot impulses ``f`
 εf``.  Their sum with multipliers ``b`` and ``l`` is ``φ = bᵀM a − bᵀJ_sᵀf + lᵀJ_s a + ε lᵀf``.  All vectors in this
 module are in the axes of a root link, which is a link whose parent is the world.  Therefore the inertia of a subtree
 is the sum of the inertias of its links.  A motion of joint j turns all links after joint j by ``S_j ×``.  In link
-axes, their velocities for ``a`` change by ``U_j(a) = −S_j × V_p(a)``, where p is the parent of j.  The derivatives
-are::
+axes, the velocities of these links for ``a`` change by ``U_j(a) = −S_j × V_p(a)``, where p is the parent of j.  The
+derivatives are::
 
     ∂φ/∂q_j       = U_j(b)ᵀF_j(a) + U_j(a)ᵀF_j(b)
     ∂²φ/∂q_j∂q_k  = U_j(b)ᵀA_k(a) + U_j(a)ᵀA_k(b),   A_k = S_k ×* F_k + I_k U_k,   for k in the subtree of j
@@ -116,7 +116,7 @@ class JumpDerivatives:
         return ca.tril2symm(below) + ca.diag(self._tree.armature)
 
     def _of_momentum(self, motion: _Motion) -> ca.SX:
-        """Return the derivative of ``M x + J_sᵀ(impulses)``; arguments of :meth:`_motion`, shape (nv, joints)."""
+        """Return ``∂(M x + J_sᵀ f)/∂q``, shape (nv, joints); ``motion`` is the :meth:`_motion` of x and f."""
         below = _kept(self._momenta.T @ motion.turned, self._lies_on(self._of_v, self._of_u))
         above = _kept(motion.changed.T @ self._subspaces, self._lies_on(self._of_u, self._of_v, itself=False))
         return below + above.T

@@ -45,10 +45,10 @@ class Kinematics:
     """Kinematics of a ``pin.Model`` at the configuration ``q``, shape (nq, 1).
 
     A joint with infinite armature is locked and does not move in an impact.  ``locked`` contains the velocity entries
-    of locked joints.  ``extra_inertia`` maps joint indices to constant 6×6 inertias in link coordinates.  They are
-    added to the inertias of the model; for example, a foot with compliance ε gets the point mass 1/ε.  With
-    ``limbs``, parameters replace the constants that differ between repeated limbs.  ``chart_x`` contains the chart
-    coordinates of ``q``.  Only :attr:`quaternions` needs ``chart_x``.
+    of locked joints.  ``extra_inertia`` maps joint indices to constant 6×6 inertias in link coordinates.  These
+    inertias are added to the inertias of the model; for example, a foot with compliance ε gets the point mass 1/ε.
+    With ``limbs``, parameters replace the constants that differ between repeated limbs.  ``chart_x`` contains the
+    chart coordinates of ``q``.  Only :attr:`quaternions` needs ``chart_x``.
     """
 
     def __init__(

@@ -127,7 +127,7 @@ class MjcfLayout:
 
     def state(self, qpos: Array, qvel: Array) -> tuple[Array, Array]:
         """Convert ``qpos`` and ``qvel`` to the Pinocchio configuration, shape (nq,), and velocity, shape (nv,)."""
-        # For speed, this method does not compute the matrix T, because simulations call it in every tick.
+        # Simulations call this method in every tick.  For speed, it does not compute the matrix T of ``qvel = T v``.
         q, v = self.q(qpos), qvel[self._rates]
         for slot in self._turning:
             turn = _turn(slot, q[slot.joint.q])

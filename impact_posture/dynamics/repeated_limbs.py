@@ -19,7 +19,7 @@ from impact_posture.dynamics.spatial import constant, rounded
 from impact_posture.robot.model_joints import finite_armature
 
 # A constant that is zero in only one of two limbs costs operations in both limbs.  Limbs are treated as repeated only
-# if the number of nonzero constants increases by at most this factor.
+# if this increases their number of nonzero constants at most by this factor.
 _FILL = 1.25
 # Numbers of SIMD lanes, in order of preference.
 _WIDTHS = (4, 2)
@@ -91,7 +91,7 @@ class RepeatedLimbs:
         return expression
 
     def indicator(self, joint: int, of: int) -> ca.SX:
-        """Return a parameter that is one in the lane of the joint ``of``, and zero in the other lanes."""
+        """Return a parameter that is one for the limb of the joint ``of``, and zero for other limbs of the group."""
         place = self.places[of]
         return self._parameter(self.places[joint], f"{place.position}.on.{place.lane}", float(joint == of))
 

@@ -106,7 +106,7 @@ class Spin:
     """Rotation about a coordinate axis, given by the cosine and sine of the angle.
 
     ``axis`` is 0, 1 or 2.  ``sense`` is −1 if the joint axis points opposite to the coordinate axis, and 1 otherwise.
-    ``sine`` already includes this sign.
+    ``sine`` is already multiplied by ``sense``.
     """
 
     axis: int

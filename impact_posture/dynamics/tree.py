@@ -1,7 +1,7 @@
 """Dynamics of a robot at a symbolic configuration, by the articulated-body algorithm in O(n).
 
-All quantities are in link coordinates.  ``M`` does not depend on the pose of the base.  This pose only rotates world
-directions to link coordinates.  Notation and signs follow Featherstone, *Rigid Body Dynamics Algorithms*
+All quantities are in link coordinates.  ``M`` does not depend on the pose of the base.  The pose is needed only to
+rotate world directions to link coordinates.  Notation and signs follow Featherstone, *Rigid Body Dynamics Algorithms*
 (2008), but the linear part is first, as in Pinocchio.
 """
 
@@ -217,8 +217,8 @@ class Tree(Kinematics):
         """Return cluster → ``(pivot, I^A, D⁻¹Uᵀ, I^A − U D⁻¹Uᵀ)`` with ``U = I^A S`` and ``D = SᵀU + armature``.
 
         ``I^A`` is the articulated inertia of the link (Featherstone 2008, chapter 7), block diagonal for several
-        links.  The pivot is ``1/D`` for one rate, ``D`` for a joint with several axes, and zero for a locked joint
-        (infinite ``D``).
+        links.  The pivot is ``1/D`` if D is a number, ``D`` for a joint with several axes, and zero for a locked
+        joint (infinite ``D``).
         """
         articulated = dict(self._inertia)
         factors: dict[_Cluster, tuple[ca.SX, ...]] = {}
@@ -241,14 +241,14 @@ class Tree(Kinematics):
     def respond(self, tau: ca.SX | None = None, wrenches: Sequence[Wrench] = ()) -> Response:
         """Solve ``M a = τ + Σ Jᵀ w`` by the articulated-body algorithm in O(n), without computing ``M``.
 
-        The same sweeps give the force through joint i, ``f_i = I^A_i v_i + p^A_i``.  Couplings between joints at
-        different links add a torque ``Kᵀμ`` such that ``K a = 0``.  Each row of K is 1 at a follower, and minus the
-        ratio at the leader of this follower.
+        The sweeps over the tree also give the force through joint i, ``f_i = I^A_i v_i + p^A_i``.  Couplings between
+        joints at different links add a torque ``Kᵀμ`` such that ``K a = 0``.  Each row of K is 1 at a follower, and
+        minus the ratio at the leader of this follower.
         """
         if not self._coupling_responses:
             return self._free_response(tau, wrenches)
         tau = ca.SX(self.nv, 1) if tau is None else tau
-        # Without Kᵀμ, row k of K a is the product of τ + Σ Jᵀ w with column k of M⁻¹Kᵀ.
+        # If μ = 0, row k of K a is the product of τ + Σ Jᵀ w with column k of M⁻¹Kᵀ.
         pushes = [(wrench.point.joint, self.link_force(wrench)) for wrench in wrenches]
         gaps = [
             ca.dot(tau, x.a) + sum(ca.dot(force, x.velocities[joint]) for joint, force in pushes)

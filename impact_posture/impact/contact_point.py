@@ -27,7 +27,7 @@ class EarlyTouch:
 
     @property
     def fact(self) -> str:
-        """Description of the link that is touched first, without a hint."""
+        """State which link the surface touches first, without a hint."""
         beyond = f"{1e3 * self.front.reach:.0f} mm beyond the contact point at {self.contact.frame}"
         return f"a flat surface touches {self.front.link} first, {beyond}"
 

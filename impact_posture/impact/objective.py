@@ -79,7 +79,7 @@ class WorstCase(Minimized, Protocol):
         """Numeric impact quantities of the first contact for the nominal robot model."""
 
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
-        """Return the largest value and its tangent gradient, shape (nv,), as expressions of the symbols in ``k``."""
+        """Return the objective and its tangent gradient, shape (nv,), as expressions of the symbols in ``k``."""
 
 
 class Objective(Minimized, Protocol):
@@ -110,7 +110,7 @@ class Objective(Minimized, Protocol):
         """Argument ``parameters`` of :meth:`lift`, shape (k,), which can change without rebuilding the program."""
 
     def movable(self, q: Array) -> bool:
-        """Return whether the contact can move at ``q``; if it cannot, the value is only a rounding error."""
+        """Return whether the contact can move at ``q``; if not, the objective is only a rounding error."""
 
     def blind_motions(self) -> Array:
         """Return base twists that do not change the value, world axes, linear first, shape (k, 6)."""

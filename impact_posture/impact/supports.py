@@ -62,7 +62,7 @@ def refuse_held(robot: Robot, contact: ImpactContact, supports: Sequence[Support
 
 
 def refuse_rigid(robot: Robot, supports: Sequence[Support]) -> None:
-    """Raise ``InputError`` if all joints of a standing robot are locked, so that only the supports could yield."""
+    """Raise ``InputError`` if the robot has supports and all joints are locked, because then nothing moves."""
     if supports and np.isinf(robot.model.armature[6:]).all():
         what = f"all joints of {robot.name} are locked and its feet stay, so nothing moves in an impact"
         hint = "choose reflected or link, or no `support` for a robot off the ground"

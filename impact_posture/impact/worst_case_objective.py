@@ -240,9 +240,9 @@ class WorstCaseObjective:
     def blind_motions(self) -> Array:
         """Return base twists that do not change the value, world axes, linear first, shape (k, 6).
 
-        The value depends on the pose of the base only through the normal in base axes.  Therefore
-        translations and the rotation about the normal do not change it.  If the normal turns with the robot, no
-        rotation changes the value.  If contacts have different normals, every rotation may change the value.
+        The value depends on the pose of the base only through the normal in base axes.  Therefore translations and
+        the rotation about the normal do not change the value.  If the normal turns with the robot, no rotation
+        changes the value.  For contacts with different normals, any rotation may change the value.
         """
         n = np.array(self.contact.normal)
         turns = n[None, :]

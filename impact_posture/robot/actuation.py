@@ -104,7 +104,7 @@ def allocation_matrix(model: pin.Model, propulsion: PropulsionSpec) -> Array:
     body.
     """
     if not is_free_flyer(model):
-        raise SpecError("rotors on a robot that cannot fly", where="propulsion", hint='set root = "free-flyer"')
+        raise SpecError("has rotors, but the base is fixed", where="propulsion", hint='set root = "free-flyer"')
     if not model.existFrame(propulsion.frame):
         raise FrameNotFound(propulsion.frame, (f.name for f in model.frames), where="propulsion.frame")
     frame = model.frames[model.getFrameId(propulsion.frame)]
@@ -112,7 +112,7 @@ def allocation_matrix(model: pin.Model, propulsion: PropulsionSpec) -> Array:
         fault = f"frame '{propulsion.frame}' is not on the base body"
         raise SpecError(fault, where="propulsion.frame", hint="name a frame that is fixed to the floating base")
     if not propulsion.rotors:
-        raise SpecError("has no rotors", where="propulsion.rotors", hint="list them, or leave propulsion out")
+        raise SpecError("has no rotors", where="propulsion.rotors", hint="list the rotors, or leave propulsion out")
     columns = []
     for rotor in propulsion.rotors:
         direction = np.asarray(rotor.direction, dtype=float)

@@ -62,8 +62,8 @@ def armature_warning(model: pin.Model, source: str, held: Sequence[str]) -> tupl
     which = "" if len(bare) == len(counted) else f" at {listed(bare, 3)}"
     origin = "" if source == "none" else f" ({source})"
     return (
-        f"armature is zero{which}{origin}. Geared motors usually have some, and H scales like 1/armature² "
-        "where it dominates; give `armature` or robot.toml [armature]",
+        f"armature is zero{which}{origin}. Geared motors usually have armature, and H scales like "
+        "1/armature² where armature dominates; give `armature` or robot.toml [armature]",
     )
 
 

@@ -129,7 +129,7 @@ def tips(robot: Robot, feet: Sequence[str] = ()) -> tuple[str, ...]:
 def fingers(robot: Robot) -> tuple[str, ...]:
     """Return the joints with a name like "finger" or "gripper", and all joints after them.
 
-    The result is empty if nothing else moves, because the robot is then a hand, whose fingers are hit.
+    The result is empty if no other joint moves, because the robot is then a hand whose fingers receive the impact.
     """
     names = robot.model.names
     moving = tuple(
@@ -155,7 +155,7 @@ def wheels(robot: Robot) -> tuple[str, ...]:
 def propellers(robot: Robot) -> tuple[str, ...]:
     """Return at least three links on the base, or on joints of the base, with a name like "rotor" or "prop".
 
-    The result is empty for legged robots, because their links of this name are the rotors of motors.
+    The result is empty for legged robots, whose links with "rotor" in the name are the rotors of motors.
     """
     model, base = robot.model, 1 if robot.floating else 0
     on_base = {base, *(i for i in joint_range(model) if model.parents[i] == base and not len(model.children[i]))}

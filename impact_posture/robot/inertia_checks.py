@@ -46,7 +46,7 @@ def check_inertias(root: ET.Element, model: pin.Model, path: Path, accept: bool)
         size, words = fault
         body = float(np.linalg.eigvalsh(model.inertias[joint].inertia)[-1])
         if size <= _TRIANGLE_SLACK * body:
-            warnings.append(f"{words}; too small to matter in the body it belongs to")
+            warnings.append(f"{words}; too small to matter in the inertia of its body")
         elif accept:
             warnings.append(f"{words}; accepted by robot.toml")
         else:

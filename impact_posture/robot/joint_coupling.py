@@ -86,7 +86,7 @@ def urdf_couplings(root: ET.Element, where: str) -> tuple[tuple[JointCoupling, .
                 _set_limits(joint, -2 * ENDLESS, 2 * ENDLESS)
             elif kind not in ("revolute", "prismatic"):
                 fault = f"joint '{joint.get('name')}' of type {kind} is coupled by <mimic>"
-                raise UrdfError(fault, where=where, hint="only revolute, prismatic and continuous joints can be")
+                raise UrdfError(fault, where=where, hint="couple only revolute, prismatic and continuous joints")
     return couplings, warnings
 
 

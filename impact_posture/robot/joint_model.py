@@ -1,9 +1,9 @@
 """Joint models: the inertia at the joints in an impact, with rotors, without rotors, or with locked joints.
 
 With a soft spring between rotor and link, a short impact ends before the rotor turns.  The inertia is then ``M``, the
-mass matrix of the links.  With a stiff transmission, the rotor moves with the link, and the inertia is ``M + B``,
-where ``B`` is the armature.  A joint that cannot be driven from its link does not move.  The armature in these three
-cases is zero, the reflected rotor inertia, and infinite.
+mass matrix of the links, and the armature is zero.  With a stiff transmission, the rotor moves with the link.  The
+inertia is then ``M + B``, where the armature ``B`` is the reflected rotor inertia.  A joint that cannot be driven
+from its link does not move, so its armature is infinite.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ class Transmissions:
     """Transmission of each velocity entry, shape (nv,); a floating base has no transmission.
 
     The rotor of a ``rigid`` joint moves with the link.  A ``locked`` joint cannot be driven from its link.
-    ``stiffness`` between rotor and link is in N·m/rad (N/m if prismatic).  It is infinite if robot.toml does not
-    state it.  ``damping`` acts in parallel with this spring, N·m·s/rad (N·s/m).
+    ``stiffness`` between rotor and link is in N·m/rad (N/m if prismatic), and infinite if robot.toml states none.
+    ``damping`` acts in parallel with this spring, N·m·s/rad (N·s/m).
     """
 
     rigid: Mask
@@ -119,7 +119,7 @@ def describe_joints(robot: Robot) -> str:
     held, kept = int(np.isinf(armature).sum()), int((np.isfinite(armature) & (armature > 0)).sum())
     words = {
         "reflected": "links and rotors",
-        "elastic": "rotors on springs; H, G, V, S, E of the first moment",
+        "elastic": "links, and rotors on springs; H, G, V, S, E at the beginning of the impact",
         "link": "links without rotors" + (f", but {kept} rigid transmissions" if kept else ""),
     }
     parts = [words.get(robot.joint_model), f"{held} of {len(armature)} joints rigid" if held else ""]

@@ -79,8 +79,8 @@ def read_mjcf(path: Path, root: Root | None) -> MjcfFile:
     """Compile an MJCF.  ``root`` adds or removes the free joint; ``None`` keeps the root of the file.
 
     Raises:
-        MjcfError: MuJoCo rejects the file, crashes, or takes too much time or memory.  Or the file couples joints by
-            loops, tendons or polynomials.
+        MjcfError: MuJoCo rejects the file, crashes, or takes too much time or memory; or loops, tendons or
+            polynomials couple joints.
         InputError: MuJoCo is not installed.
     """
     import_mujoco()
@@ -102,7 +102,7 @@ def _read(path: Path, root: Root | None) -> MjcfFile:
     with unwarned(), warnings.catch_warnings(action="ignore"):
         try:
             spec = mujoco.MjSpec.from_file(str(path))
-            spec.nkey = len(spec.keys)  # MuJoCo also allocates the stated number.
+            spec.nkey = len(spec.keys)  # A larger number in the file would only waste memory.
             if len(spec.bodies) < 2:  # The first body is the world.
                 hint = "name the file of a robot, or the file that includes this part"
                 raise MjcfError("has no body", where=str(path), hint=hint)
@@ -155,7 +155,7 @@ def _compile(spec: Any, path: Path) -> tuple[Any, list[str]]:
             continue
         body = geom.parent
         if body.name != "world" and not (body.explicitinertial and spec.compiler.inertiafromgeom != _FROM_GEOMS):
-            fault = f"no mesh '{name}', and body '{body.name}' takes its inertia from it"
+            fault = f"no mesh '{name}', and body '{body.name}' takes its inertia from the mesh"
             raise MjcfError(fault, where=str(path), hint="add the mesh, or state <inertial>")
         spec.delete(geom)
     for part in (*(asset for asset in assets if asset.name in missing), *spec.skins):
@@ -226,7 +226,7 @@ def _check_tree(model: Any, path: Path) -> None:
     if free.size and (free.size > 1 or free[0]):
         name = object_name(model, "body", int(model.jnt_bodyid[free[-1]]))
         fault = f"body '{name}' floats in addition to the robot"
-        hint = "remove it in a copy of the file, or put the floating robot first; or name the robot without its scene"
+        hint = "remove the body in a copy of the file, put the robot first, or name the file without the scene"
         raise MjcfError(fault, where=str(path), hint=hint)
 
 

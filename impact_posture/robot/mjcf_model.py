@@ -1,8 +1,8 @@
 """Build a ``pin.Model`` from a compiled MJCF (``mujoco.MjModel``).
 
-``q`` and ``qpos`` differ in two points only.  Quaternions in ``q`` are in the order x y z w.  A joint without limits
-has a cosine and a sine in ``q``, like a continuous joint of a URDF.  The reference position ``ref`` of a joint is
-part of its placement.
+The Pinocchio configuration ``q`` differs from the MuJoCo ``qpos`` only in two respects.  Quaternions in ``q`` are in
+the order x y z w.  A joint without limits has a cosine and a sine in ``q``, like a continuous joint of a URDF.  The
+reference position ``ref`` of a joint is part of its placement.
 """
 
 from __future__ import annotations

@@ -49,7 +49,7 @@ def rounded(values: object) -> list[str]:
 
 
 def _axis(joint: pin.JointModel) -> Array:
-    """Return the motion subspace of a joint at the neutral configuration; unlike the type, it depends on the axis."""
+    """Return the motion subspace of a joint, which contains the axis, at the neutral configuration."""
     model = pin.Model()
     model.addJoint(0, joint, pin.SE3.Identity(), "joint")
     # Use a model with this joint alone, because the joint reads its entries of the configuration by index.

@@ -22,7 +22,7 @@ def named_postures(
     """Return all named postures, shape (nq,) each, and the name of the default posture.
 
     Postures of ``robot.toml`` (``spec``) replace keyframes of the MJCF and ``group_state`` tags of the SRDF with the
-    same name.  The caller must set the limits of the model before.
+    same name.  Before the call, the limits of the model must be set.
 
     Raises:
         UrdfError: The SRDF cannot be read.
@@ -98,7 +98,7 @@ def _toml_postures(described: RobotDescription, spec: RobotSpec, name: str) -> d
             index = joint_index(model, joint, where)
             if model.nvs[index] != 1:
                 fault = f"posture '{key}': joint '{joint}' has {model.nvs[index]} degrees of freedom, not one number"
-                raise SpecError(fault, where=name, hint="give it in an SRDF")
+                raise SpecError(fault, where=name, hint="give the posture in an SRDF")
             if not np.isfinite(value):
                 raise SpecError(f"posture '{key}': joint '{joint}' is {value}", where=name, hint="give a number")
             q[q_slice(model, index)] = scalar_entries(model, index, value, where)

@@ -107,7 +107,7 @@ def _load(path: Path) -> Mapping[str, object]:
 
 
 def _configuration(robot: Robot, data: Mapping[str, object], where: str) -> Array:
-    """Return the configuration in the content of a posture file.  The keys decide between the three formats."""
+    """Return the configuration in a posture file.  The keys of ``data`` show which of three formats the file has."""
     schema = data.get("schema", SCHEMA)
     if schema != SCHEMA:
         fault = f"schema '{shown(schema)}' is not a posture"
@@ -175,11 +175,11 @@ def _by_name(robot: Robot, q: Array, data: Mapping[str, object], where: str) -> 
 
 
 def _check_same(robot: Robot, q: Array, named: Array, where: str) -> None:
-    """Raise an error if a file gives different values for an entry of ``q``, for example after an edit of one."""
+    """Raise an error if a file gives an entry of ``q`` twice, with different values."""
     for name, one, other in zip(robot.q_names, q, named, strict=True):
         if abs(one - other) > _SAME:
-            fault = f"{name} is {one:.6g} in q, but {other:.6g} by its name"
-            raise PostureError(fault, where=where, hint="remove q, or else base and joints")
+            fault = f"{name} is {one:.6g} in q, but {other:.6g} under its name"
+            raise PostureError(fault, where=where, hint="remove either q, or base and joints")
 
 
 def set_joints(robot: Robot, q: Array, joints: Mapping[str, object], where: str) -> Array:

@@ -44,8 +44,8 @@ FIXED_CONVENTION = "q = [joints]; v = [joint rates]; SI units, radians"
 
 # A joint that exceeds a position limit by less than this (rad, m) is treated as if it were at the limit.
 _ON_LIMIT = 1e-6
-# In a posture, a follower may deviate from the position that its leader requires by this (rad, m).  For example, the
-# numbers of the posture may be rounded.
+# In a posture, the position of a follower may differ by this value (rad, m) from the position that its leader
+# requires.  For example, the numbers of the posture may be rounded.
 _COUPLED = 1e-3
 
 
@@ -104,9 +104,9 @@ class Robot:
         joint_model: Model of the inertia at the joints (:func:`~impact_posture.robot.joint_model.with_joint_model`).
         stated_armature: Original armature, shape (nv,), if ``joint_model`` has changed ``model.armature``.
         couplings: Couplings of joints.  In each coupling, a follower moves with its leader.
-        settings: Settings of :func:`~impact_posture.robot.robot_loader.load_robot`; ``None`` if another function made
-            the robot.
-        files: Files of the robot; ``None`` if another function made the robot.
+        settings: Settings of :func:`~impact_posture.robot.robot_loader.load_robot`; ``None`` for a robot that was
+            built otherwise.
+        files: Files from which the robot was loaded; ``None`` for a robot that was built otherwise.
         mjcf: The compiled MJCF; ``None`` for a URDF.
     """
 

@@ -184,7 +184,7 @@ def locate(robot: str, options: LoadOptions) -> Located:
     urdf = stored.path
     if os.path.exists(urdf) and not (os.path.isfile(urdf) or os.path.isdir(urdf)):
         fault = "is a pipe or a device, which cannot be read more than once"
-        raise UrdfError(fault, where=str(urdf), hint="write its content into a file")
+        raise UrdfError(fault, where=str(urdf), hint="write its content into a regular file")
     folders = tuple(_package_folders(spec, options, base, name or urdf.stem, *stored.folders))
     if urdf.suffix == ".xacro":
         arguments = {**stored.arguments, **spec.model.xacro_args, **(options.xacro_arg or {})}
@@ -254,7 +254,7 @@ def _override_limits(model: pin.Model, spec: RobotSpec, name: str) -> None:
         index = joint_index(model, joint, where)
         if model.nqs[index] != 1:
             fault = f"joint '{joint}' has no position limits"
-            raise SpecError(fault, where=where, hint="remove it, because the joint turns freely")
+            raise SpecError(fault, where=where, hint="remove these limits, because the joint turns freely")
         lower[model.idx_qs[index]], upper[model.idx_qs[index]] = low, high
     model.lowerPositionLimit, model.upperPositionLimit = lower, upper
     for values, kind in ((spec.limits.velocity, "Velocity"), (spec.limits.effort, "Effort")):

@@ -67,8 +67,9 @@ class Support(_Table):
         kind: ``point`` keeps the velocity of the contact point at zero.  ``surface`` also keeps the angular velocity
             at zero.
         offset: Contact point relative to the origin of the frame, in the frame, meters.
-        size: Half extents (x, y) of the sole around the contact point, in the frame, meters.  If it is zero, the size
-            of a surface is measured on the shapes of the foot.  A surface without size and shapes bears no moment.
+        size: Half extents (x, y) of the sole around the contact point, in the frame, meters.  If ``size`` is zero,
+            the size of a surface is measured on the shapes of the foot.  A surface without size and shapes bears no
+            moment.
     """
 
     frame: str

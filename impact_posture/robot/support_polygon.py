@@ -63,7 +63,7 @@ def polygon_edges(points: Iterable[Array]) -> tuple[Array, Array] | None:
 
 def nearest_in_hull(points: Array) -> Array:
     """Return the point nearest to zero in the convex hull of points, shape (k, d), m."""
-    # The weights minimize |Σ w p|² + (Σ w − 1)².  Divided by their sum, they give the nearest point.
+    # The weights minimize |Σ w p|² + (Σ w − 1)².  The nearest point is Σ w p / Σ w.
     equations = np.vstack([points.T, np.ones(len(points))])
     weights = nonnegative_least_squares(equations, np.append(np.zeros(points.shape[1]), 1.0))
     return np.asarray(points.T @ weights / weights.sum())

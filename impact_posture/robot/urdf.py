@@ -29,8 +29,8 @@ MOST_DEGREES_OF_FREEDOM = 200
 FARTHEST = 1e10
 # Largest number of joints in a chain, including fixed joints.  Above 2,000, the URDF parser overflows the stack.
 _DEEPEST = 1_000
-# A comment.  A comment may contain "--", which XML forbids and urdfdom accepts.  Without an end, it reaches to the
-# end of the file.
+# A comment.  A comment may contain "--", which XML forbids and urdfdom accepts.  A comment that does not end reaches
+# to the end of the file.
 _COMMENT = re.compile(r"<!--.*?(?:-->|\Z)", re.DOTALL)
 # An ampersand that does not begin an entity.  XML forbids this ampersand, and urdfdom accepts it.
 _LONE_AMPERSAND = re.compile(r"&(?!(?:amp|lt|gt|quot|apos|#\d+|#x[\da-fA-F]+);)")
@@ -173,7 +173,7 @@ def _read(path: Path) -> tuple[str, ET.Element]:
         UrdfError: The file is missing, is not a URDF, or contains expressions or elements of xacro.
     """
     if os.path.isdir(path):
-        raise UrdfError("is a folder", where=str(path), hint="name the .urdf file in it")
+        raise UrdfError("is a folder", where=str(path), hint="name the .urdf file in this folder")
     try:
         text = _xml_text(path)
         root = _parse_xml(text)

@@ -23,7 +23,7 @@ from impact_posture.system.output_folder import write_whole
 
 # Module of ROS from which xacro gets the folder of a package.
 _INDEX = "ament_index_python.packages"
-# Processor time to expand a file, s.  Expressions of the file can compute for hours.
+# Limit of the processor time to expand a file, s, because expressions in a file can take hours.
 _SECONDS = 10.0
 
 
@@ -91,7 +91,7 @@ def expand_xacro(
     ``arguments`` replace the defaults of ``<xacro:arg>``.  For a package in ``$(find PACKAGE)`` or in a
     ``package://`` path, the function searches ``packages``, then ``folders``, then the folders above the file, then
     ROS.  Relative paths of meshes start from the folder of the xacro file.  They may also start from the folder above
-    it, where expanded files often are.
+    that folder, where expanded files often are.
 
     Raises:
         UrdfError: The file cannot be expanded, or this takes too much time or memory.

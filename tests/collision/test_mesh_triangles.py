@@ -128,7 +128,7 @@ def test_the_hull_replaces_parts_that_cannot_be_separated(tmp_path: Path, monkey
     collada(tmp_path / "cubes.dae")
     shapes = arm(tmp_path, mesh("cubes.dae"))
     (line,) = shapes.warnings
-    assert line.startswith("shape middle is its convex hull: the parts of ") and line.endswith(
+    assert line.startswith("shape middle is replaced by its convex hull: the parts of ") and line.endswith(
         "export it as one part"
     )
     (solid,) = [shape.geometry for shape in shapes.geometry.geometryObjects if shape.name == "middle"]

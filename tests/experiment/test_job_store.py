@@ -188,7 +188,7 @@ def test_a_diverged_simulation_is_a_result(aerial: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(job_store, "execute", diverge)
     (document,) = run_batch([Job(str(aerial), "nominal")])
     assert (document["status"], document["seed"], document["runs"]) == ("control lost", 0, [])
-    assert "the state ran away at t = 1 s" in document["events"][0]["what"] and document["events"][0]["time"] == 1.0
+    assert "the state diverged at t = 1 s" in document["events"][0]["what"] and document["events"][0]["time"] == 1.0
 
 
 def test_unknown_names_are_refused_before_any_run(aerial: Path) -> None:

@@ -246,7 +246,7 @@ def test_the_line_of_an_estimate(hits: list[int], best: int, line: str) -> None:
     end = " of further starts would lead to another objective"
     assert SearchEstimate.of("multistart", hits, best).line == line + end
     bound = SearchEstimate.of("multistart", hits, best, bound=True, partial=True).line
-    assert bound == line.replace("about", "at most about") + end + " if they ignore clearances and loads"
+    assert bound == line.replace("about", "at most about") + end + " if these starts ignore clearances and loads"
 
 
 def test_values_that_are_nearly_equal_are_one() -> None:

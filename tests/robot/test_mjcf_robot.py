@@ -301,7 +301,7 @@ def test_missing_meshes(tmp_path: Path) -> None:
     robot = loaded(tmp_path, drawn)
     assert robot.warnings[0] == "no mesh 'm.stl': their shapes are left out; inertias are stated"
     assert "hand" in {shape.link for shape in read_shapes(robot).shapes}
-    with pytest.raises(MjcfError, match=r"no mesh 'm\.stl', and body 'hand' takes its inertia from it"):
+    with pytest.raises(MjcfError, match=r"no mesh 'm\.stl', and body 'hand' takes its inertia from the mesh"):
         loaded(tmp_path, text.replace(tip, mesh))
 
 

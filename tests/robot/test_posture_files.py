@@ -60,7 +60,7 @@ def test_posture_json_names_the_entries_of_q_and_gives_one_angle_per_joint(tmp_p
     assert np.allclose(read_posture(loaded, save(tmp_path / "both.json", content)), q, rtol=0, atol=1e-15)
     # A user may edit the angles, but not one of two contradicting values.
     content["joints"] = {**content["joints"], "a": 1.0}  # type: ignore[dict-item]
-    with pytest.raises(PostureError, match=r"a cos is -0.416147 in q, but 0.540302 by its name; remove q"):
+    with pytest.raises(PostureError, match=r"a cos is -0.416147 in q, but 0.540302 under its name; remove either q"):
         read_posture(loaded, save(tmp_path / "edited.json", content))
     del content["q"]
     assert read_posture(loaded, save(tmp_path / "edited.json", content))[0] == np.cos(1.0)

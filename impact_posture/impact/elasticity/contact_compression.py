@@ -12,9 +12,9 @@ The mass is ``m = nᵀp/v`` with the impulse p of the plastic impact at the fric
 (:mod:`impact_posture.impact.friction.coulomb_impact`).  This mass is exact.  While the normal force grows, the point
 sticks or slides along one constant direction, so the friction force is proportional to the normal force.
 
-The ratio ``x = T/√(m C)`` determines whether the rotors behind elastic transmissions respond to the impact.  It
-compares T with the response time of the joint springs.  Here ``m`` is the mass for the links alone, and ``C =
-jK⁻¹jᵀ`` with the stiffness of the joint springs and ``j = nᵀJ``.
+The ratio ``x = T/√(m C)`` determines whether the rotors behind elastic transmissions respond to the impact.  The
+denominator ``√(m C)`` is the response time of the joint springs.  Here ``m`` is the mass for the links alone, and ``C
+= jK⁻¹jᵀ`` with the stiffness of the joint springs and ``j = nᵀJ``.
 """
 
 from __future__ import annotations
@@ -146,8 +146,8 @@ class Compression:
         contact: Elasticity of the contact; ``None`` if not known.
         mass: Effective mass m with friction, kg: normal impulse per approach speed.  The joint model of the objective
             determines the inertia.
-        time: Compression time T, s, for this mass; ``None`` if not known.
-        peak_force: Largest normal force F, N, for this mass; ``None`` if not known.
+        time: Compression time T, s, of the mass ``mass``; ``None`` if not known.
+        peak_force: Largest normal force F, N, of the mass ``mass``; ``None`` if not known.
         x: Ratio ``T/√(m C)``, with T and m of the links alone; ``None`` if the contact or the springs are unknown.
         by_material: Name of a material → x for a contact with this material; empty unless the springs are known and
             the contact is unknown.
@@ -273,7 +273,8 @@ def springs_along(case: ImpactCase, q: Array) -> tuple[float, float] | None:
 def unknown_springs(case: ImpactCase, q: Array) -> tuple[str, ...]:
     """Return the joints that the impact moves and that have a rotor behind a spring of unknown stiffness.
 
-    A joint counts if its jump with the links alone is at least :data:`_MOVED` of the largest jump of a joint.
+    The impact moves a joint if the velocity jump of the joint, without rotors, is at least the fraction
+    :data:`_MOVED` of the largest jump of any joint.
     """
     robot, table = case.robot, transmissions(case.robot)
     joints = np.arange(robot.nv) >= robot.first_joint

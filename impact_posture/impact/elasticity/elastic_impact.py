@@ -47,7 +47,7 @@ _LONGEST = 1e8
 _HELD = 1e8
 # Step between the samples from which the peaks are computed, rad of the fastest oscillation.
 _SAMPLE = 0.1
-# Smallest and largest number of these samples.
+# Smallest and largest number of samples from which the peaks are computed.
 _FEWEST, _MOST = 100, 20_000
 
 
@@ -206,7 +206,8 @@ class ElasticImpact:
 class _Compression:
     """Motion of springs and contact from touch to greatest compression, at an approach speed of 1 m/s.
 
-    ``mobility`` is the matrix ``A``.  ``columns`` contains ``P = −M⁻¹Cᵀ``, shape (nv, m+1), and the support impulses.
+    ``mobility`` is the matrix ``A``.  ``columns`` contains ``P = −M⁻¹Cᵀ``, shape (nv, m+1), and the support impulses;
+    the docstring of this module defines ``A`` and ``C``.
     """
 
     def __init__(
@@ -221,7 +222,7 @@ class _Compression:
         R = np.sqrt(kappa)[:, None] * self._L
         self._generator = np.block([[np.zeros_like(R), R], [-R.T, -(self._L.T * d) @ self._L]])
         self._fastest = float(np.linalg.norm(self._generator, 2))
-        # At touch, only δ changes.  Its rate is the last row of L times the velocity part of the state.
+        # At touch, only the compression δ changes.  δ̇ is the last row of L times the velocity part of the state.
         self._row, self._start = np.append(np.zeros(len(R)), self._L[-1]), np.zeros(2 * len(R))
         self._start[-1] = 1 / self._L[-1, -1]
         self.duration, self.state = self._greatest_compression()
@@ -232,7 +233,7 @@ class _Compression:
         return np.asarray(scipy.linalg.solve_triangular(self._L, moved, trans=1, lower=True))
 
     def force(self, states: Array) -> Array:
-        """Return the forces ``κc + dċ``, springs first, for one state or for states as columns."""
+        """Return the forces ``κc + dċ``, springs first; ``states`` is one state, or one state per column."""
         r = len(self.kappa)
         return np.asarray((np.sqrt(self.kappa) * states[:r].T + self.d * (self._L @ states[r:]).T).T)
 
@@ -282,7 +283,8 @@ class _Compression:
         seed = np.append(np.zeros(r), -L.T @ weighed)
         seed = seed - self._row * (seed @ rate) / (self._row @ rate)
         moved = T * scipy.linalg.expm_frechet(T * self._generator.T, np.outer(seed, self._start), compute_expm=False)
-        # With L fixed, A appears only in the lower rows of the generator, −L⁻¹A [κ^½, d L].
+        # The lower rows of the generator equal −L⁻¹A [κ^½, d L].  For fixed L, A appears nowhere else in the
+        # generator.
         inner = moved[r:, :r] * np.sqrt(self.kappa) + (moved[r:, r:] @ L.T) * self.d
         X = scipy.linalg.solve_triangular(L, inner, trans=1, lower=True) + np.outer(weighed, self.impulse(self.state))
         return np.asarray(-(X + X.T) / 2)

@@ -57,7 +57,7 @@ class Evaluation(JsonBlock):
         q: Configuration, shape (nq,).
         scalars: H, G, V, S and E, computed with the supports; also attributes of the evaluation.
         objective: Value of the objective; for ``impulse`` with the factor λ̄², where λ̄ is the largest impulse of the
-            contact.  ``None`` if it does not exist at ``q``.
+            contact.  ``None`` if the objective does not exist at ``q``.
         gradient: Tangent gradient of H, shape (nv,).  The entry of a leader joint includes the motion of its
             followers.  The entries of followers are zero.
         objective_gradient: Tangent gradient of the objective, shape (nv,); ``None`` if it does not exist at ``q``.
@@ -165,8 +165,8 @@ class Evaluation(JsonBlock):
 
 
 _JUMP = ("speed", "restitution", "frictionless", "sticking", "coulomb", "energy_loss")
-# Keys of the block of each single contact.  Posture and objective are not included, because they are the same for all
-# contacts.
+# Keys of the block of each single contact.  Posture and objective are the same for all contacts, so the block of a
+# single contact omits them.
 _CONTACT = (
     "H",
     "G",

@@ -1,4 +1,4 @@
-"""Speed with which the joints can move the contact along its normal; in a singular direction, they cannot yield."""
+"""Speed at which the joints can move the contact along its normal; if the speed is small, they cannot yield."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.model_joints import v_slice
 from impact_posture.system.arrays import Array, null_space
 
-# The direction is singular if the speed along the normal is below this fraction of the largest speed in any
-# direction.
+# The posture is singular along the normal if the speed of the contact along the normal is below this fraction of its
+# largest speed in any direction.
 _SINGULAR = 0.05
 # A singular value of the Jacobian of the feet below this fraction of the largest one is a rounding error.
 _RANK = 1e-9
@@ -21,7 +21,7 @@ _RANK = 1e-9
 
 @dataclass(frozen=True)
 class JointYield(JsonBlock):
-    """Speed of the contact for a joint velocity of norm 1; feet are fixed, and the base moves as the joints require.
+    """Speed of the contact for a joint velocity of norm 1; the feet are fixed, and the base follows the joints.
 
     Attributes:
         along: Largest speed of the contact along the normal, m/rad: the singular value of ``nᵀJ`` of the joints.
@@ -35,7 +35,7 @@ class JointYield(JsonBlock):
 
     @property
     def singular(self) -> bool:
-        """Whether the joints cannot yield along the normal."""
+        """Whether the joints can hardly move the contact along the normal."""
         return self.along < _SINGULAR * self.largest
 
 

@@ -17,8 +17,8 @@ from impact_posture.system.arrays import Array
 _TOLERANCE = 1e-12
 # Largest number of iterations of ADMM.
 _ITERATIONS = 20_000
-# Rules for the penalty of ADMM.  The second rule is tried if ADMM does not converge with the first rule.  This can
-# happen if the forces on the corners of a sole are not unique.
+# Rules for the penalty of ADMM.  If ADMM does not converge with the first rule, the second rule is used.  ADMM may
+# fail to converge if the forces on the corners of a sole are not unique.
 _RULES = (pin.ADMMUpdateRule.SPECTRAL, pin.ADMMUpdateRule.OSQP)
 # Largest error of impulses that fulfill the conditions, divided by the largest impulse.
 _ERROR = 1e-7

@@ -2,8 +2,8 @@
 
 The metric assumes that the feet stay in place, even if the ground would have to pull.  If ``J_s`` does not have full
 row rank, the support impulses are not unique.  All solutions are ``f + N z``, where ``N`` is a basis of ``{f: J_sᵀ f
-= 0}``, the impulses with which feet press against each other.  The weight is a finite force,
-and an impact takes no time.  The weight therefore has no impulse, and no effect.
+= 0}``, the impulses with which feet press against each other.  The weight has no effect, because it is a finite force
+and the impact takes no time.
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ class ContactStability(JsonBlock):
     Attributes:
         friction: Least friction coefficient for which all feet stay in place; infinite if above ten; ``None`` if a
             foot lifts or a sole tips for every friction coefficient.
-        feet: Impulse on each foot.  The impulses are within the friction cones if possible.  Otherwise, the largest
-            pull of the ground is as small as possible.
+        feet: Impulse on each foot.  The impulses are within the friction cones if possible, and otherwise minimize
+            the largest pull of the ground.
         freedom: Dimension of the set of possible impulses; zero if the impulses are unique.
     """
 

@@ -45,8 +45,8 @@ class CoulombImpact:
         slip: Velocity of the contact point after the impact, world axes, shape (3,); zero if the point sticks.
         sigma: Multiplier ``σ``, 1/kg; zero if the point sticks, infinite if there is no friction.
         mass: Effective mass with friction, ``m = nᵀp``, kg: the normal impulse per approach speed.  Without friction,
-            ``m = 1/G``.  A frictionless impact of this mass compresses a spring along the normal by the same amount,
-            because the impulse has a constant direction.
+            ``m = 1/G``.  With friction, the impulse has a constant direction, so a linear contact spring is
+            compressed as in a frictionless impact of the mass ``m``.
     """
 
     sticks: bool
@@ -100,7 +100,7 @@ def _tangential(n: Array, B: Array) -> tuple[Array, Array]:
 
 
 def _multiplier(values: Array, g: Array, friction: float, sigma: float) -> float:
-    """Return the ``σ`` for which ``‖g/(values + σ)‖ = μ``.  The norm must exceed ``μ`` for the initial ``sigma``.
+    """Return the ``σ`` for which ``‖g/(values + σ)‖ = μ``.  The norm must exceed ``μ`` at ``σ = sigma``.
 
     The inverse of the norm is concave in ``σ``.  Newton's method for the inverse therefore converges from below
     without overshoot (Moré and Sorensen, Computing a Trust Region Step, 1983).  Importing a solver of SciPy would
@@ -157,7 +157,7 @@ def coulomb_direction(B: ca.SX, n: ca.SX, friction: float | ca.SX) -> tuple[ca.S
 
     ``w = ((τ + σ)g − B_tt g)/(σ² + τσ + δ)`` with trace ``τ`` and determinant ``δ`` of ``B_tt``.  If ``B_tt`` is
     singular, as for planar robots, the point cannot move in one tangential direction.  The mobility in this direction
-    is set to ``τ``; ``w`` does not change, because ``g`` has no component in this direction.  At the transition
+    is set to ``τ``.  This does not change ``w``, because ``g`` has no component in this direction.  At the transition
     between sticking and sliding, ``K`` is the matrix for sticking.
     """
     size, Bn, across = ca.trace(B), B @ n, ca.SX.eye(3) - n @ n.T

@@ -31,7 +31,7 @@ from impact_posture.system.arrays import Array
 # A contact point moves if its speed is above this fraction of the approach speed.  A moving point lifts if its upward
 # speed is above a tenth of this fraction; otherwise it slides.
 _MOVES = 0.01
-# Number of steps of an impact in which the weight is counted.
+# Number of steps into which an impact is divided if the weight of the robot is included.
 _STEPS = 8
 # Resolution of the shortest contact time at which the feet stay, as a fraction of the largest time.
 _SHORTEST = 1e-4
@@ -107,8 +107,8 @@ def unilateral_impact(
     """Compute the impact with feet that can lift and slide.
 
     ``hit`` are the oracles of the hit contacts at the posture of ``feet``.  ``speed`` is ``(1 + e) v_n``, m/s, and
-    ``time`` the compression time T, s.  Return ``None`` if no impulses fulfill the conditions, or if the weight is
-    counted and the robot cannot stand in this posture.
+    ``time`` the compression time T, s.  Return ``None`` if no impulses fulfill the conditions, or if ``time`` is
+    above zero and the robot cannot stand in this posture.
     """
     if time > 0 and feet.forces is None:
         return None
@@ -118,7 +118,7 @@ def unilateral_impact(
     friction = np.array([*(oracle.contact.friction for oracle in hit), *[feet.friction] * len(feet.frames)])
     responses = feet.respond(J)
     B = J @ responses
-    # The approach speed that is left after each step.
+    # The remaining approach speed after each step.
     left = speed * np.cos(np.pi / 2 * np.linspace(0, 1, _STEPS + 1)[1:]) if time > 0 else np.zeros(1)
     weight = np.zeros(normals.shape)
     if time > 0 and feet.forces is not None:
@@ -144,7 +144,7 @@ def unilateral_impact(
 def longest_lifting_time(feet: StandingFeet, hit: Sequence[ImpactOracle], speed: float, most: float = 1.0) -> float:
     """Return the compression time, s, above which no foot lifts or slides; infinite if above ``most``.
 
-    The weight that a foot carries grows with the time, so bisection finds this time up to 5 %.
+    The impulse of the weight on a foot grows with the compression time, so bisection finds the time up to 5 %.
     """
 
     def moves(time: float) -> bool:

@@ -48,9 +48,9 @@ class CoulombKind(ImpactKind):
     def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
         """Return the gradient of the actual branch (stick or slide), and of the other branch if it is relevant.
 
-        The other branch is relevant if its value is at most ``within`` below ``C``.  A branch with a larger value is
-        irrelevant: ``C`` is then the smaller of two smooth functions, so the kink cannot be a minimum.  At the kink,
-        the gradient of sticking comes first.
+        The other branch is relevant if its value is at most ``within`` below ``C``.  If its value is above ``C``,
+        then ``C`` is the smaller of two smooth functions.  The kink cannot then be a minimum, and the other branch is
+        irrelevant.  At the kink, the gradient of sticking comes first.
         """
         oracle, sides = self.oracle, [coulomb_impact(self.oracle, q)]
         if within > 0:
@@ -76,9 +76,10 @@ class CoulombKind(ImpactKind):
         return value, k.size_gradient(x, [impact_at(case, r)])
 
     def impulse(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX, ca.SX]:
-        """Return the impulse ``p`` per unit approach speed, ``Bn``, and the matrix ``K`` with ``∂w = K ∂B (n − w)``.
+        """Return the impulse ``p`` per unit approach speed, ``Bn``, and ``K`` as in :func:`coulomb_direction`.
 
-        All three are in the axes ``normal_frame`` of the contact.  The friction must be above zero.
+        The results are in the axes ``normal_frame`` of the contact, and ``B`` is the mobility ``JM⁻¹Jᵀ``.  The
+        friction must be above zero.
         """
         R = in_world(self.case, k.tree, ca.SX.eye(3))
         B = R.T @ k.mobility @ R

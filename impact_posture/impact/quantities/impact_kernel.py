@@ -102,7 +102,7 @@ class ImpactKernel:
     def size_gradient(self, jump: Response, r: Sequence[Wrench] = ()) -> ca.SX:
         """Return the tangent gradient of ``aᵀWa`` for the velocity jump ``a`` of a response, shape (nv,).
 
-        Without ``r``, the impulses that cause the jump are constant.  Otherwise impulses ``p(q)`` at the points of
+        If ``r`` is empty, the impulses that cause the jump are constant.  If not, impulses ``p(q)`` at the points of
         ``r`` cause the jump, and ``∂pᵀJM⁻¹Wa = rᵀ∂B p`` with ``B = JM⁻¹Jᵀ``.
         """
         if self.metric.kind == "kinetic" and not self._supported and not r:

@@ -165,8 +165,8 @@ class ImpactOracle:
     def gradient_S(self, q: Array, normal: Array | None = None) -> Array:
         """Return the tangent gradient of S, shape (nv,), with ``normal`` as in :meth:`gradient_H`.
 
-        If ``JM⁻¹Jᵀ`` is singular, the contact point is constrained only in the directions in which it can move.  The
-        gradient is correct if these directions are constant, as in a planar robot.
+        If ``JM⁻¹Jᵀ`` is singular, the contact point can move only in the directions of a plane or a line.  The
+        gradient is correct if this plane or line has a constant orientation, as for a planar robot.
 
         Raises:
             MetricError: S does not exist at ``q``.
@@ -228,7 +228,7 @@ class ImpactOracle:
         """Return ``∂_q lᵀ(M + J_sᵀJ_s/ε)r = ∂_q [lᵀMr − f_lᵀJ_s r − f_rᵀJ_s l]``, shape (nv,).
 
         ``l`` and ``r`` are the velocity jumps of ``left`` and ``right``, and ``f_l`` and ``f_r`` are their support
-        impulses.  The derivative treats all four as constant.
+        impulses.  The derivative treats ``l``, ``r``, ``f_l`` and ``f_r`` as constant.
         """
         gradient = self.numeric.inertial_gradient(left.a, right.a)
         start = 0

@@ -16,8 +16,8 @@ from impact_posture.impact.impact_contact import point_on
 from impact_posture.impact.metric import Metric
 from impact_posture.system.arrays import Array
 
-# Initial distance of the unknown t of :func:`worst_of` from the lower bounds of t, in units of the scale, for each
-# attempt.  The interior-point method needs a start that satisfies the inequalities strictly.
+# Initial distance of the unknown ``t`` of :func:`worst_of` from the lower bounds of ``t``, divided by ``scale``, for
+# each attempt.  The interior-point method needs a start that satisfies the inequalities strictly.
 ABOVE = (0.01, 1.0, 0.1)
 
 
@@ -163,7 +163,7 @@ class UnknownJump:
 
 
 class PlacedJump(NamedTuple):
-    """An unknown velocity jump, with its first row and its first column in the Jacobian of a lifted form."""
+    """An unknown velocity jump; its derivatives begin at ``row`` and ``column`` of the Jacobian of a lifted form."""
 
     jump: UnknownJump
     row: int
@@ -234,5 +234,5 @@ def worst_of(parts: Sequence[Lifted | UnknownJump], values: Sequence[ca.SX], sca
 
 
 def worst_of_guesses(parts: Sequence[Guess], largest: float, attempt: int) -> Guess:
-    """Return initial values for :func:`worst_of`; ``largest`` is the maximum of ``values`` in units of the scale."""
+    """Return initial values for :func:`worst_of`; ``largest`` is the maximum of ``values``, divided by ``scale``."""
     return Guess.joined([*parts, Guess.unbounded(np.array([largest + ABOVE[attempt]]))])

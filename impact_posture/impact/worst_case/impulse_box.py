@@ -88,9 +88,7 @@ def check_contacts(contacts: Sequence[ImpactContact], kind: type[ImpactKind], *,
     if bilateral and not kind.adds_up:
         raise ContactError(f"{kind.name} has no bounds on impulses", where="bilateral", hint="omit `bilateral`")
     if not (kind.adds_up or kind.simultaneous):
-        what = (
-            f"{kind.name} assumes the approach speed of one contact, which does not determine the impulses of several"
-        )
+        what = f"{kind.name} assumes the approach speed of one contact, but there are several contacts"
         raise MetricError(what, where="objective", hint="choose impulse or sticking, or give one `contact`")
     if cone:
         what = "the worst case over a cone of normals is exact for one contact only"

@@ -49,7 +49,7 @@ class ModelSet:
 
     def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
         tied, gaps = finite_maximum(self.values(q), within)
-        # This member is ``gap`` below the maximum, so its subgradients may lie ``within − gap`` below the member's
+        # The value of model k is ``gap`` below the maximum, so its subgradients may be ``within − gap`` below this
         # value.
         parts = [self.members[k].subgradients(q, max(within - gap, 0.0)) for k, gap in zip(tied, gaps, strict=True)]
         return Subgradients(

@@ -2,18 +2,18 @@
 
 The objective types ``impulse``, ``sticking`` and ``energy`` increase with a quadratic form ``nᵀK(q)n``
 (:class:`~impact_posture.impact.kinds.impact_kind.QuadraticKind`).  The largest value of this form over a cone can be
-computed exactly (:mod:`impact_posture.impact.worst_case.worst_normal`).  The objective type ``speed`` is not a
-function of such a form, and no exact worst normal is known for it.
+computed exactly (:mod:`impact_posture.impact.worst_case.worst_normal`).  The objective type ``speed`` does not depend
+on the normal through a single quadratic form, and no exact worst normal is known for this type.
 
 In the program, the dual problem replaces the maximum over the normals.  In the axes of the cone (half angle α), let
-``P(q) = [a, bᵀ; b, C]`` be the matrix of the form, divided by the value of the form at the start.  With ``c = cos α``
-and ``s = sin α``, the program is::
+``P(q) = [a, bᵀ; b, C]`` be ``K(q)``, divided by the value of ``nᵀKn`` at the initial posture.  With ``c = cos α`` and
+``s = sin α``, the program is::
 
     min t,   t = a + sτ,   Z = [τ − ρ, −bᵀ; −b, (st + ρc²) I − sC] = L²,   ρ ≥ 0
 
 ``Z`` equals ``D(tI − P − μ(n₀n₀ᵀ − c²I))D`` with ``D = diag(s^-½, s^½, s^½)`` and ``μ = ρ/s``.  The entries of
-``Z`` stay bounded as α tends to zero.  At mirror-symmetric postures, two eigenvalues of ``Z`` are zero.  There the
-gradient of ``det Z`` vanishes, but the gradient of ``Z = L²`` with a symmetric ``L`` does not.
+``Z`` stay bounded as α tends to zero.  At mirror-symmetric postures, two eigenvalues of ``Z`` are zero.  At these
+postures the gradient of ``det Z`` vanishes, but the gradient of ``Z = L²`` with a symmetric ``L`` does not.
 """
 
 from __future__ import annotations

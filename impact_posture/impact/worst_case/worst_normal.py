@@ -121,7 +121,7 @@ def tied_normals(A: Array, axis: Array, cone_deg: float, worst: WorstNormal, tol
     values, vectors = np.linalg.eigh(A)
     top = vectors[:, values >= values[-1] - tolerance * size]
     # If the largest eigenvalue is double, the plane of its eigenvectors cuts the cap in an arc of worst normals.  If
-    # it is triple, all normals of the cap are worst normals.
+    # the largest eigenvalue is triple, all normals of the cap are worst normals.
     tilts = alpha * (np.linspace(0, 1, 9) if top.shape[1] == 3 else np.ones(1))
     rings = [np.vstack([np.full_like(_GRID, np.cos(tilt)), np.sin(tilt) * circle]) for tilt in tilts]
     planes = [top[:, [i, j]] @ circle for i in range(top.shape[1]) for j in range(i)]
@@ -157,7 +157,7 @@ def _inside(P: Array, c: float, size: float) -> Array:
 def _on_edge(P: Array, c: float, s: float, size: float) -> Array:
     """Return the normals ``(c, s cos φ, s sin φ)`` on the edge of the cap with a local maximum of the form, as rows.
 
-    If the form is constant on the edge, three points are added.
+    If the form is constant on the edge, three normals on the edge are returned.
     """
     # The value divided by 2s is Re(A z + B z²) plus a constant, with z = exp(iφ).
     A, B = c * complex(P[0, 1], -P[0, 2]), s * complex(P[1, 1] - P[2, 2], -2 * P[1, 2]) / 4

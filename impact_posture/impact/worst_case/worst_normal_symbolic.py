@@ -7,7 +7,7 @@ the left without overshoot:
 - The normal is on the edge, ``n = (c, s w)``, ``|w| = 1``.  Then ``w_i = p_i/(ν − d_i)`` with ``p = b c/s``, and
   ``ν`` is the root of ``1/|w| = 1`` (a trust-region problem in the plane; Moré and Sorensen 1983).
 - The normal is inside the cone, ``n ∝ (1, b_i/(λ − d_i))``.  Then ``λ`` is the largest eigenvalue, the root of
-  ``λ − a = Σ b_i²/(λ − d_i)``.  The normal is inside if and only if ``λ > ν``.
+  ``λ − a = Σ b_i²/(λ − d_i)``.  The worst normal is inside the cone if and only if ``λ > ν``.
 """
 
 from __future__ import annotations
@@ -82,7 +82,8 @@ def _on_circle(p: ca.SX, eta: ca.SX, gap: ca.SX) -> ca.SX:
     """Return the unit vector ``w``.  If ``p₁ = 0``, both signs of its first entry are valid, and plus is used."""
     y = ca.fmin(ca.fmax(p[1] / ca.fmax(eta + gap, _TINY), -1), 1)
     rest = 1 - y * y
-    # For a large first entry, use the square root.  For a small entry the square root loses digits; use the quotient.
+    # If the first entry is large, compute it by the square root.  If it is small, the square root loses digits, so
+    # use the quotient.
     x = ca.if_else(rest > 1e-6, ca.if_else(p[0] >= 0, 1.0, -1.0) * ca.sqrt(rest), p[0] / eta)
     return ca.vertcat(x, y) / ca.hypot(x, y)
 

@@ -9,11 +9,11 @@ or the peak force of the impact.  Its bound d goes from the least price to the p
 bounded and not penalized, because minimizers of ``objective + w·price`` give only points on the convex hull of the
 curve.
 
-One program solves for all d, because d is the bound of one of its rows.  The bounds are solved along two paths:
-outward from the posture with the least price, and inward from the optimum.  Each solve starts at the result of the
-previous solve.  If this result satisfies the new bound, the solve also uses the multipliers of the previous solve.
-For each bound, the best certified result is kept.  If the best result for a neighboring bound comes from another
-path, one more solve starts from this result.  The curve is therefore the lower envelope of the paths.
+One program solves for all d, because d is the bound of one of its rows.  The problems for all bounds d are solved in
+two orders: from the least bound to the greatest, and from the greatest to the least.  Each solve starts at the result
+of the previous solve.  If this result satisfies the new bound, the solve also uses the multipliers of the previous
+solve.  For each bound, the best certified result is kept.  If the best result for a neighboring bound comes from the
+other order, one more solve starts from this result.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _EQUAL = 1e-9
 _RISE = 1e-6
 # Maximum number of optima, besides the best optimum, from which a path starts.
 _PATHS = 3
-# Maximum number of rounds that start from results for neighboring bounds.
+# Maximum number of rounds in which solves start from results for neighboring bounds.
 _ROUNDS = 3
 # Maximum number of times that missing rows are added to the program for one point.
 _GROWTH = 8
@@ -67,9 +67,9 @@ def pareto_front(
 ) -> TradeOff:
     """Compute the trade-off curve in ``points`` equal steps of the price, which is the distance or the peak force.
 
-    The regularization is left out, because the bound on the distance replaces it.  ``force`` contains the contact and
-    the approach speed (m/s), from which the peak force is computed.  If ``force`` is ``None``, the price is the
-    distance.  ``progress`` is called with the numbers of finished and planned solves.
+    The objective is computed without regularization, because the bound on the distance has the same purpose.
+    ``force`` contains the contact and the approach speed (m/s), from which the peak force is computed.  If ``force``
+    is ``None``, the price is the distance.  ``progress`` is called with the numbers of finished and planned solves.
 
     Raises:
         InputError: The number of points is below 1, or the price is the force and there are several contacts.
@@ -141,13 +141,13 @@ class _Curve:
         self._scale = problem.objective.value(price.nearest)
         self._best: list[_End | None] = [None] * len(levels)
         self._tried: set[tuple[int, bytes]] = set()
-        # The key is the posture of a result as bytes.  The value is the warm start from this result.
+        # Posture of each result (as bytes) → warm start from this result.
         self._ends: dict[bytes, WarmStart] = {}
         self.solves = 0
         self._take(0, "outward", price.nearest)
 
     def follow(self, solution: PostureSolution, progress: Progress | None) -> None:
-        """Solve outward from the least price, and inward from the optimum and from other optima with lower prices."""
+        """Solve from the least price for increasing bounds, and from the best optima for decreasing bounds."""
         last = len(self._levels) - 1
         planned = 2 * last
         self._take(last, "inward", solution.q)
@@ -177,7 +177,7 @@ class _Curve:
                 break
 
     def _try_neighbors(self, order: range, neighbor: int) -> bool:
-        """Solve from a neighbor's result if its path differs or it is better; return whether a point improved."""
+        """Solve again from better results for neighboring bounds; return whether a point of the curve improved."""
         better = False
         for k in order:
             best, other = self._best[k], self._best[k + neighbor]

@@ -18,7 +18,7 @@ KNEE = 1 / 3
 
 @dataclass(frozen=True, eq=False)
 class TradePoint(JsonBlock):
-    """The best posture within one bound, with H, G, V and S of its impact; S is ``None`` if undefined.
+    """The best posture under a bound on distance or force, with H, G, V and S of its impact.
 
     Attributes:
         within: The bound on the distance from the initial posture (rad mixed with m), or on the peak force (N).
@@ -83,8 +83,8 @@ class TradeOff:
 def find_knee(distances: Array, objectives: Array) -> int | None:
     """Return the index of the point with the largest difference: fraction of the gain minus fraction of the distance.
 
-    The gain is the decrease of the objective along the curve.  Return ``None`` if the excess is below :data:`KNEE`,
-    or if there is no gain.
+    The gain is the decrease of the objective along the curve.  Return ``None`` if this difference is below
+    :data:`KNEE`, or if the objective does not decrease.
     """
     far, gain = distances[-1] - distances[0], objectives[0] - objectives[-1]
     if not (far > 0 and gain > 0):

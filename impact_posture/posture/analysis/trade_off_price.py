@@ -1,4 +1,4 @@
-"""What a trade-off can bound ("price"): the distance from the initial posture, or the peak force."""
+"""The price of a posture, which a trade-off bounds: its distance from the initial posture, or its peak force."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from impact_posture.system.arrays import Array
 class DistancePrice:
     """The distance from the initial posture, rad mixed with m.
 
-    ``nearest`` is the posture with the least price, shape (nq,).  ``against`` is the name of the price in options and
-    files.  ``nothing`` is the message if the optimum already has the least price.
+    ``nearest`` is the posture with the least price, shape (nq,).  Options and files call the price ``against``.
+    ``nothing`` is the message if the optimum already has the least price.
     """
 
     model: pin.Model
@@ -36,7 +36,7 @@ class DistancePrice:
         return distance(Chart(self.model), q, self.nearest)
 
     def bound(self, level: float) -> Constraint:
-        """Return the constraint that the price is at most ``level``; one program can be used for all levels."""
+        """Return the constraint that the price is at most ``level``; the program for another level is the same."""
         return WithinDistance(Chart(self.model), self.nearest, level)
 
     def within(self, q: Array, level: float) -> Array:

@@ -127,7 +127,7 @@ def in_words(change: float) -> str:
 def outcome_of(parts: tuple[Change, ...]) -> str:
     """Return the outcome: ``better`` if a quantity falls and none grows, or a text on what falls and grows."""
     grow, fall = _sides([part for part in parts if part.grows]), _sides([part for part in parts if part.falls])
-    # A side with a quantity that falls and a quantity that grows counts only as growing.
+    # If a quantity of an effect falls and another quantity of the effect grows, the effect is reported as growing.
     fall = [side for side in fall if side not in grow]
     if not grow:
         return "better" if fall else "no better"
@@ -137,7 +137,7 @@ def outcome_of(parts: tuple[Change, ...]) -> str:
 
 
 def _sides(parts: list[Change]) -> list[Side]:
-    """Return the distinct sides of the changes; ``impulse`` is left out if ``force`` is among them."""
+    """Return the effects that the changes belong to, without repetition; ``force`` replaces ``impulse``."""
     sides = list(dict.fromkeys(part.side for part in parts))
     return [side for side in sides if side != "impulse" or "force" not in sides]
 

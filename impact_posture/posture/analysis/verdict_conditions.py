@@ -88,9 +88,9 @@ def _arrival(impact: ResolvedImpact, known: Circumstances) -> Iterator[Condition
 
 
 def near_surface(tilt: float, shift: float) -> str:
-    """Return words for a strike whose links are clear of the surface only up to this tilt, degrees, and shift, m."""
+    """Return the text for a surface that other links may touch if its tilt (degrees) or shift (m) is larger."""
     limits = f"tilted by more than {tilt:g}° or shifted by more than {1e3 * shift:g} mm"
-    return f"another link may touch the surface first if it is {limits}"
+    return f"another link may touch the surface first if the surface is {limits}"
 
 
 def _surface(known: Circumstances) -> Iterator[Condition]:

@@ -32,8 +32,8 @@ FASTEST = 1e3
 # Shortest duration of a run-up, s, which a controller can follow.
 RUN_UP = 0.1
 # A joint with the velocity ν at the impact needs the distance ``_ROOM · ν`` for its run-up; ``_ROOM`` is in s.  The
-# velocity rises from rest, so its mean is about ν/2.  A tenth is added, because the velocity does not rise exactly
-# linearly.
+# velocity rises from rest, so its mean is about ν/2.  The factor 1.1 is needed because the velocity does not rise
+# exactly linearly.
 _ROOM = 1.1 * RUN_UP / 2
 # Fraction of the velocity limits that a strike may use at the impact; some joints are faster before the impact.
 USABLE = 0.97
@@ -48,7 +48,8 @@ class MovingPoint:
     Attributes:
         axes: Matrix ``D``, shape (3, 3), whose rows are the normal and two tangents, or the axes of the world.
         rows: Indices of the constrained rows of ``(D v, D ω)``.
-        comes: Whether the point moves towards the surface.  If so, the first row is ``nᵀv = −σ``; if not, ``d`` is 0.
+        comes: Whether the point moves towards the surface.  If true, the first row is ``nᵀv = −σ``; if false, ``d``
+            is 0.
         in_frame: Whether the axes turn with the frame of the point; otherwise they are fixed in the world.
     """
 
@@ -71,13 +72,13 @@ class MovingPoint:
         return np.concatenate([self.axes.T @ wrench[:3], self.axes.T @ wrench[3:]])
 
     def jacobian(self, model: Numeric) -> Array:
-        """Return the matrix that maps the generalized velocity to the rows, shape (k, nv)."""
+        """Return the matrix that maps ``ν`` to the constrained rows of ``(D v, D ω)``, shape (k, nv)."""
         J = model.jacobian(self.point)
         D = self.axes @ model.placement(self.point).rotation.T if self.in_frame else self.axes
         return np.vstack([D @ J[:3], D @ J[3:]])[list(self.rows)]
 
     def symbolic(self, tree: Tree, velocities: dict[int, ca.SX], axes: ca.SX) -> ca.SX:
-        """Return the rows as an expression of the link velocities, shape (k, 1)."""
+        """Return the constrained rows of ``(D v, D ω)`` as an expression of the link velocities, shape (k, 1)."""
         twist = tree.point_velocity(self.point, velocities)
         if self.in_frame:
             R = tree.rotations[self.point.joint] @ ca.SX(self.point.rotation)
@@ -151,7 +152,7 @@ class AttainableSpeed:
         if robot.floating and not flies and self.points and ((bringing & standing).any() or not bringing.any()):
             self.unknown = "the legs move the contact, and the speed of such a motion is not computed"
         elif not self.points or flies or (free.any() and not stated.any()):
-            self.unknown = "nothing bounds it: no joint with a velocity limit determines this speed"
+            self.unknown = "nothing bounds it, because no joint with a velocity limit determines this speed"
         if len(self.independent) > len(self.free):
             self.points = [replace(moved, rows=moved.rows[:3]) if moved.comes else moved for moved in self.points]
 
@@ -202,7 +203,7 @@ class AttainableSpeed:
 
     @property
     def room(self) -> Array:
-        """Map from the free velocities to the room that they need, shape (r, k)."""
+        """Map from the free velocities to the distances that a run-up needs, rad or m, shape (r, k)."""
         return np.asarray(_ROOM * np.diag(self.scale)[self.roomy])
 
     def at(self, model: Numeric) -> Attained:

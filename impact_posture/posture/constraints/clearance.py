@@ -18,8 +18,8 @@ from impact_posture.posture.constraints.pair_distances import PairDistances
 from impact_posture.posture.constraints.separating_plane import EQUATIONS, Corners, SeparatingPlane
 from impact_posture.system.arrays import Array
 
-# Distances minus the clearance are computed exactly if they are below this value, m.  For larger distances, lower
-# bounds are enough.
+# Distances minus the clearance are computed exactly if they are below this value, m; larger distances are replaced by
+# lower bounds.
 _NEAR = 0.01
 # The certificate contains the rows of a pair if its distance minus the clearance is below this value, m.
 _ROWS = 1e-3
@@ -123,8 +123,9 @@ class Clearance(Constraint):
             pair, old = self._pairs[k], active.get(k, Corners(frozenset(), frozenset()))
             if k in unknowns and pair.slack(unknowns[k]) > -values[k] / 2:
                 continue
-            # If the closest corners already have rows, all corners are added.  The plane of the program may differ
-            # from the plane between the closest points, and may then cut any corner without a row.
+            # If the closest corners already have rows, all corners are added.  The plane in the program may differ
+            # from the plane between the closest points.  Any corner without a row may then lie on the wrong side of
+            # the plane.
             for new in (pair.corners(model), pair.every_corner):
                 if not (new.a <= old.a and new.b <= old.b):
                     active[k] = Corners(old.a | new.a, old.b | new.b)
@@ -192,6 +193,6 @@ class Clearance(Constraint):
 
 
 class SpreadClearance(Clearance):
-    """Clearance to the surfaces of a strike in all their places within the stated tilt and shift."""
+    """Clearance to the surfaces of a strike, for every tilt and shift of the surfaces within the stated limits."""
 
     at_impact = True

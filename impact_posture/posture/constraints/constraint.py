@@ -86,7 +86,7 @@ class Linearization:
     @staticmethod
     def joined(parts: Sequence[Linearization], nv: int) -> Linearization:
         """Stack the rows of linearizations that share no auxiliary unknowns."""
-        # Leave out empty parts.  Most parts are empty, because most postures are far from most bounds.
+        # Omit linearizations without rows; most have none, because most postures are far from most bounds.
         parts = [part for part in parts if part.names or part.auxiliary.shape[1]]
         if len(parts) == 1:
             return parts[0]

@@ -61,7 +61,7 @@ class ImpactBounds(Constraint):
         self._units = dict(zip(self._names, units, strict=True))
         self.lower = np.array([*[-np.inf] * len(mass), *[-jump] * count])
         self.upper = np.array([*mass, *[jump] * count])
-        # Each row has the value cᵀΔν + s m, with its covector c and its factor s (0 or 1).
+        # The value of a row is cᵀΔν + s m, with a covector c and a factor s (0 or 1) for each row.
         self._covectors = np.vstack([np.zeros((len(mass), robot.nv)), np.eye(robot.nv)[self._joints]])
         self._shares = np.array([*[1.0] * len(mass), *[0.0] * count])
 
@@ -78,7 +78,7 @@ class ImpactBounds(Constraint):
 
     @property
     def unknowns(self) -> int:
-        # Without friction, the impulse adds one unknown.  With friction, it adds the six unknowns of ``CoulombKind``.
+        # The impulse adds one unknown without friction, and the six unknowns of ``CoulombKind`` with friction.
         return self._motion + (6 if self._slips else 1)
 
     @property

@@ -16,9 +16,9 @@ class PairDistances:
     """Distances of pairs of bodies, minus the clearance, for a sequence of postures.
 
     Three fast lower bounds show that most pairs are far apart.  The first bound is the distance between balls around
-    the bodies.  The second is the last exact distance minus the motion of the bodies since then.  The third is the
-    larger of the two gaps between the hulls along two directions.  The values at the last posture are stored, because
-    a search evaluates a posture several times.
+    the bodies.  The second bound is the last exact distance minus the motion of the bodies since then.  The third
+    bound is the gap between the hulls along a direction; two directions are tried, and the larger gap is used.  The
+    values at the last posture are stored, because a search evaluates a posture several times.
     """
 
     def __init__(self, pairs: Sequence[SeparatingPlane]) -> None:

@@ -79,10 +79,10 @@ class HeldOrientation(ExpressionConstraint):
     """The frame keeps its world orientation ``target``, shape (3, 3), or only the direction of one axis.
 
     The rows are twice the vector part of the error quaternion ``Q_right* ⊗ Q_target* ⊗ Q(q) ⊗ Q_right``.  To first
-    order, they are the rotation vector of the error, rad.  The error is zero only at the target and largest at 180°,
-    where a skew-symmetric error is zero again.  If ``axis``, a vector in the frame, is given, ``Q_right`` turns z to
-    ``axis``, and only the first two components are rows.  The frame may then turn about ``axis``.  If ``axis`` is
-    ``None``, ``Q_right`` is the identity, and all three components are rows.
+    order, the rows are the rotation vector of the error, rad.  The error is zero only at the target and largest at
+    180°, where a skew-symmetric error is zero again.  If ``axis``, a vector in the frame, is given, ``Q_right`` turns
+    z to ``axis``, and only the first two components are rows.  The frame may then turn about ``axis``.  If ``axis``
+    is ``None``, ``Q_right`` is the identity, and all three components are rows.
     """
 
     unit = "rad"

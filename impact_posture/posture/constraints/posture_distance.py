@@ -19,8 +19,8 @@ def distance_squared(chart: Chart, q: Any, reference: Any) -> Any:
     """Return the squared distance of two configurations (``SX`` or ``DM``), approximately ``‖q ⊖ reference‖²``.
 
     The distance, in rad and m, is smooth everywhere.  A turn by Δ of a base, a ball joint or a continuous joint adds
-    ``4 sin²(Δ/2) = 4 (1 − (quaternion·quaternion)²) = 2 (1 − cos Δ)``.  For other joints and for position
-    coordinates, a change by Δ adds Δ².
+    ``4 sin²(Δ/2) = 4 (1 − (quaternion·quaternion)²) = 2 (1 − cos Δ)``.  A change by Δ of any other coordinate adds
+    Δ².
     """
     parts = []
     for slot in chart.slots:

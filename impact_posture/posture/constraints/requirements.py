@@ -28,7 +28,7 @@ class Requirements:
         keep: Frames whose pose must not change.
         hold: Joints whose position must not change.
         com_over_feet: Whether the center of mass must stay above the support polygon.
-        com_asked: Whether the user set ``com_over_feet``.  If not, the requirement is dropped for feet that span no
+        com_asked: Whether the user set ``com_over_feet``.  If false, the requirement is dropped for feet that span no
             area.
         com_margin: Least horizontal distance of the center of mass from the edges of the support polygon, m.
         keep_contacts: Whether the feet must neither lift off nor slide during the impact.
@@ -42,8 +42,8 @@ class Requirements:
         largest_jump: Largest allowed velocity jump of a joint per approach speed; infinite for no bound.
         approach_speed: Speed that the joints must be able to give the contact towards the surface, m/s; 0 for no
             requirement.
-        approach_asked: Whether the user gave the setting ``approach``.  If not, and the attainable speed cannot be
-            computed, the requirement is dropped without a note.
+        approach_asked: Whether the user gave the setting ``approach``.  If false, the required speed is dropped
+            without a note when the attainable speed cannot be computed.
         strike: Whether the contact point arrives at the approach speed after a run-up.  If no posture allows this
             speed, the greatest possible speed is required instead.
         collision: Whether the links must not touch each other, the surface, the ground or the obstacles.
@@ -51,7 +51,7 @@ class Requirements:
         surface: Shape of the surface: ``plane``, ``none``, or the edge length of a square patch, m; if ``None``, the
             plane or a patch is chosen for the robot.
         surface_spread: Tilt, degrees, and shift, m, of the surface at which only the struck links may touch it, if
-            ``strike`` is set.  If no posture allows this, the requirement is dropped.
+            ``strike`` is set.  If no posture allows this tilt and shift, the requirement is relaxed or dropped.
         limit_margin: Least distance of the joint positions from their limits, rad or m.
         regularization: Weight of the squared distance from the initial posture, relative to the initial objective.
     """

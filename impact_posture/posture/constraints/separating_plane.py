@@ -156,7 +156,7 @@ class SeparatingPlane:
         return lower, np.array([*[np.inf] * of_a, *[0.0] * of_b, *normal])
 
     def content(self, corners: Corners) -> str:
-        """Return the numbers in the rows as text, without the coefficients of a known plane, which are parameters."""
+        """Return the constants in the rows as text; the coefficients of a known plane are not constants."""
         bodies = [(b.point.joint, b.point.position.tolist(), b.point.rotation.tolist()) for b in (self.a, self.b)]
         points = self._x[sorted(corners.a)].tolist(), self._y[sorted(corners.b)].tolist()
         return repr((bodies, self.b.turns, self.known, points))
@@ -256,8 +256,8 @@ class SeparatingPlane:
         """
         if unknowns is not None and not self.known:
             rows = self.linearize_at(model, unknowns[:3], float(unknowns[3]))
-            # The plane of the program may cut corners without rows in the program. The pair is then inactive, and the
-            # plane between the closest points is used.
+            # Corners that have no row in the program may lie on the wrong side of the plane of the program.  The pair
+            # is then inactive, and the plane between the closest points is used.
             if rows.violation <= _KEPT:
                 return rows
         at_b = self.b.placement(model)

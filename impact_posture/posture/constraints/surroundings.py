@@ -33,7 +33,8 @@ from impact_posture.system.arrays import Array
 _BESIDE = 0.03
 # Two contacts can be at the same surface only if the cosine of the angle between their normals exceeds this value.
 _PARALLEL = 0.999
-# Number of tilted surfaces that replace a cone of surfaces.  Between them, the clearance is up to 15 % larger.
+# Number of tilted surfaces that replace a cone of surfaces.  In directions between the tilted surfaces, the clearance
+# is up to 15 % larger.
 _TILTED = 6
 # If a fixed body lies farther than this, m, behind the plane of the surface, the surface must end before this body.
 _BEHIND = 1e-3
@@ -117,7 +118,8 @@ class Surroundings:
         beside = [foot for foot in feet if abs(self._above(foot, plane)) < _BESIDE]
         for other in contacts:
             # Two equal links, such as two hands, extend equally far behind their contact points, so their surfaces
-            # coincide.  The other contact is therefore also tested against the plane through this contact point.
+            # coincide.  The contact ``other`` is therefore also tested against the plane through the contact point of
+            # ``contact``.
             facing = self._world_normal(contact) @ self._world_normal(other) > _PARALLEL
             at = point_on(self.robot, other.frame, other.offset)
             if any(abs(self._above(at, face)) < _BESIDE for face in ((plane, through) if facing else (plane,))):
@@ -142,9 +144,10 @@ class Surroundings:
 
         A point whose distance from a contact point is ``r`` along its surface has at least the distance ``clearance +
         shift + r tan(tilt)`` from this surface, to first order.  The struck links and the links that may touch the
-        surface are excepted.  ``tilt`` is in degrees, and ``shift`` in m.  A surface is tilted about its contact
-        point, towards :data:`_TILTED` sides, by slightly more than ``tilt``, so that these surfaces contain all
-        surfaces between them.  Return ``None`` if no contact has a surface, or if there are no other links.
+        surface are excepted.  ``tilt`` is in degrees, and ``shift`` in m.  Surfaces that are tilted about the contact
+        point in :data:`_TILTED` directions replace all tilts up to ``tilt``.  Their tilt is slightly larger than
+        ``tilt``, so that they also cover the directions between them.  Return ``None`` if no contact has a surface,
+        or if all links may touch the surfaces.
         """
         if not (self._depths and (tilt or shift)):
             return None
@@ -185,7 +188,7 @@ class Surroundings:
             self._walls.append(_Wall(ConvexBody.of_link(obstacle_hull(obstacle)), self._rigid([0])))
 
     def depth(self, contact: ImpactContact) -> float:
-        """Return the distance from the contact point back to its surface, m; zero if the contact has no surface."""
+        """Return how far the surface of a contact is behind the contact point, m; zero without a surface."""
         return self._depths.get(contact, 0.0)
 
     @cached_property

@@ -161,7 +161,7 @@ def _check(robot: Robot, requirements: Requirements) -> None:
         raise InputError(f"is {requirements.friction:g}", where="friction", hint="give a coefficient above zero")
     if requirements.hold_force and not requirements.holdable:
         raise InputError(
-            "has no effect without `holdable`", where="hold_force", hint="add `holdable` or leave this out"
+            "has no effect without `holdable`", where="hold_force", hint="add `holdable`, or omit `hold_force`"
         )
     for joint in requirements.hold:
         robot.joint_id(joint)

@@ -19,9 +19,9 @@ def impact_constraints(
 ) -> list[Constraint]:
     """Return the bounds on the impact and the constraints on the feet for all model variants.
 
-    It suffices that the feet stay in place for an impact at each single contact.  They then also stay for impacts at
-    all contacts at once, because friction cones are convex.  A payload moves the center of mass.  The constraint on
-    the center of mass, if ``constraints`` contains it, is therefore repeated for each model with a payload.
+    It suffices that the feet stay in place for an impact at each single contact.  The feet then also stay for impacts
+    at all contacts at once, because friction cones are convex.  A payload moves the center of mass.  The constraint
+    on the center of mass, if ``constraints`` contains it, is therefore repeated for each model with a payload.
 
     Raises:
         InputError: The feet must stay in place, but the contacts can also pull.

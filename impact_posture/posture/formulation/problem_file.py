@@ -107,14 +107,14 @@ def requirements(settings: ProblemSettings, objective: Objective) -> Requirement
     com = spec.com_over_feet and bool(objective.supports) if settings.com is None else settings.com
     if settings.obstacles and not settings.collision:
         raise InputError(
-            "have no effect without `collision`", where="obstacles", hint="add `collision` or leave this out"
+            "have no effect without `collision`", where="obstacles", hint="add `collision`, or omit the obstacles"
         )
     if com and not objective.supports:
         fault = "there are no feet to keep the center of mass over"
         raise InputError(fault, where="com", hint="add `support`, or choose no `com`")
     if settings.keep_contacts and not objective.supports:
         raise InputError(
-            "there are no feet to keep in place", where="keep_contacts", hint="add `support` or leave it out"
+            "there are no feet to keep in place", where="keep_contacts", hint="add `support`, or omit `keep_contacts`"
         )
     if settings.approach and not 0 < settings.speed <= FASTEST:
         what = "needs an approach speed above zero"

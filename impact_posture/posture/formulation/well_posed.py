@@ -91,10 +91,10 @@ def fix_undetermined_motions(
 def make_well_posed(problem: ConstrainedProblem) -> ConstrainedProblem:
     """Choose independent equality rows for the program, and constrain turns that are possible only to first order.
 
-    Four point feet on planar legs (solo8) give 12 equations of rank 10.  Two of these equations are redundant.  To
-    first order, the base can roll, although any finite roll would spread the feet.  Both the redundant equations and
-    this roll prevent the solver from converging.  So the program omits the redundant rows, which the certificate
-    still checks, and a constraint blocks the turn.
+    Four point feet on planar legs (solo8) give 12 equations of rank 10, so two equations are redundant.  To first
+    order, the base can roll, although any finite roll would spread the feet.  Both the redundant equations and this
+    roll prevent the solver from converging.  So the program omits the redundant rows, which the certificate still
+    checks, and a constraint blocks the turn.
     """
     numeric = Numeric(problem.robot.model)
     jacobian = equality_jacobian(problem, numeric.at(problem.given))

@@ -27,7 +27,7 @@ class Distribution:
 
     Attributes:
         forces: Vector ``z`` of the forces of rotors and feet, in units of the robot's weight, shape (k,).
-        shares: Signed share of each actuator (:class:`Equilibrium`), shape (actuators,).
+        shares: Signed share of its range that each actuator uses (:class:`Equilibrium`), shape (actuators,).
         unbalanced: Sum of the absolute entries of the unbalanced wrench on the base; zero if the base is balanced.
             Forces are in units of the robot's weight, moments in units of the weight times 1 m.
         jacobian: Tangent Jacobian of ``unbalanced`` and the absolute shares, shape (1 + actuators, nv).  If ``z`` has
@@ -127,7 +127,8 @@ class Equilibrium:
         """Return whether nearly even forces balance the base, and all shares are then at most ``1 − room``.
 
         Nearly even forces are thrusts in the middle of their ranges and equal foot forces, both corrected to balance
-        the base.  If they suffice, no linear program is needed.  If not, other forces may still hold the posture.
+        the base.  If nearly even forces suffice, no linear program is needed.  Even if they do not suffice, other
+        forces may hold the posture.
         """
         key = q.tobytes()
         if self._even is None or self._even[0] != key:
@@ -135,7 +136,7 @@ class Equilibrium:
         return self._even[1] <= 1 - room
 
     def _even_share(self, q: Array) -> float:
-        """Return the largest actuator share at nearly even forces; infinite if the base is not balanced."""
+        """Return the largest actuator share under nearly even forces; infinite if they do not balance the base."""
         still = self.load.torque(q, np.zeros(self.load.count), by_posture=False)
         A, b, S, c = self._affine(still.value, still.by_force)
         lower, upper = self.load.lower, self.load.upper

@@ -26,16 +26,17 @@ from impact_posture.system.arrays import Array
 _KEPT = 5e-9
 # If an actuator share differs from 1 by less than this value, its row may be active and have a multiplier.
 _NEAR = 1e-3
-# Weight of a violated actuator limit in the search for conflicts (:attr:`Constraint.price`).  It is lower than the
-# weight of a position error, so the search reports the actuators and not the pose.
+# Weight of a violated actuator limit in the search for conflicts (:attr:`Constraint.price`).  A position error has a
+# higher weight, so the search reports the actuators as the conflict, and not the pose.
 _PRICE = 1e-3
 
 
 class Holdable(Constraint):
     """The constraint that some forces z balance the base while no actuator exceeds its limits.
 
-    In the nonlinear program, ``R τ(q, z)`` must be within bounds (:class:`Equilibrium`).  ``c(q)`` has one row for
-    the unbalanced wrench on the base, and for each actuator the row ``share − 1``, where 1 is the share at a limit.
+    In the nonlinear program, the rows ``R τ(q, z) + r`` of :class:`Equilibrium` must be within bounds.  ``c(q)`` has
+    one row for the unbalanced wrench on the base, and for each actuator the row ``share − 1``, where 1 is the share
+    at a limit.
 
     Args:
         name: Name of the load, such as ``at rest``.
@@ -46,7 +47,7 @@ class Holdable(Constraint):
 
     price = _PRICE
     # Initial postures are not projected onto this constraint, so that they remain diverse.  Most searches end within
-    # the limits anyway.
+    # the actuator limits even so.
     projected = False
     by_row = True
 

@@ -68,7 +68,7 @@ class LoadCases:
     unknown: str = ""
 
     def holding(self, q: Array) -> HoldingForces | None:
-        """Return the forces that hold ``q`` at rest and under the other loads; ``None`` if there are no loads."""
+        """Return the forces that hold ``q`` under all load cases; ``None`` if there are no load cases."""
         if not self.cases:
             return None
         first, *others = [HoldingForces.of(case.name, case.equilibrium, case.unreachable, q) for case in self.cases]

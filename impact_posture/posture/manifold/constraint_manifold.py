@@ -148,7 +148,7 @@ class ConstraintManifold:
     def draw(self, rng: np.random.Generator, count: int, near: Array) -> Array:
         """Draw postures, shape (N, nx), a quarter of them near the posture ``near``, shape (nq,).
 
-        The others lie anywhere within the limits.  All these postures may violate the constraints.
+        The other postures lie anywhere within the limits.  All postures may violate the constraints.
         """
         ranges, base = draw_ranges(self.problem, self.chart), self.problem.robot.first_joint
         x = np.tile(self.chart.to_x(self.problem.given), (count, 1))
@@ -218,7 +218,7 @@ class ConstraintManifold:
         return blocked
 
     def embed(self, x: Array) -> Array:
-        """Return points, shape (N, k); their Euclidean distances equal the distances of postures that are close."""
+        """Map postures to points, shape (N, k), such that near postures and their points have equal distances."""
         parts = [np.zeros((len(x), 0))]
         for slot in self.chart.slots:
             piece = x[:, slot.x]

@@ -19,8 +19,8 @@ FEASIBLE = 1e-8
 # Maximum number of random postures that are projected onto the constraints for one start.
 ATTEMPTS = 20
 _STEPS = 80
-# Number of steps in which the violation must decrease by at least a fifth.  Otherwise the projection stops, because
-# it would probably not converge.
+# The projection stops if the violation decreases by less than a fifth within this number of steps, because the
+# projection would probably not converge.
 _PATIENCE = 16
 # Maximum number of projected postures among which one start is chosen.
 CANDIDATES = 3
@@ -147,9 +147,9 @@ def feasible_start(problem: ConstrainedProblem, index: int, seed: int, candidate
 class StartDraw:
     """The random postures of one start, projected onto the constraints, and drawn when they are needed.
 
-    Odd starts lie near the posture ``around``, by default the given posture.  Even starts lie anywhere within the
-    limits.  Near starts reach the constraints more often; far starts lead to other optima.  ``projector`` may belong
-    to the same problem with fewer rows in its program.
+    Starts with an odd index lie near the posture ``around``, by default the given posture.  Starts with an even index
+    lie anywhere within the limits.  Near starts reach the constraints more often; far starts lead to other optima.
+    ``projector`` may belong to the same problem with fewer rows in its program.
     """
 
     def __init__(

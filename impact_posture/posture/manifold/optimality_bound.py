@@ -29,8 +29,8 @@ _MOST = 200_000
 # segments of half the length.
 _RING = [[np.sqrt(0.75) * np.cos(a), np.sqrt(0.75) * np.sin(a)] for a in np.pi / 3 * np.arange(6)]
 _PARTS = {1: np.array([[-0.5], [0.5]]), 2: np.array([[0.0, 0.0], *_RING])}
-# Ratio of the radius of a part to the radius of its parent.  The ratio exceeds 1/2 so that the parts overlap.  On a
-# curved manifold, parts of exactly half the radius could leave gaps.
+# Ratio of the radius of a part to the radius of the patch that is split.  The ratio exceeds 1/2 so that the parts
+# overlap.  On a curved manifold, parts of exactly half the radius could leave gaps.
 _HALF = 0.52
 
 
@@ -40,8 +40,8 @@ class OptimalityBound:
 
     Attributes:
         best: Least objective of a feasible posture.
-        x: Posture with the objective ``best``, the center of a patch, shape (nx,); ``None`` if the known posture is
-            best.
+        x: Posture with the objective ``best``, shape (nx,); ``None`` if no patch center is better than the known
+            posture.
         patches: Number of evaluated patches.
         finished: Whether the bound of every patch is within the requested gap.
     """

@@ -23,7 +23,7 @@ _FIRST, LONGEST_STEP = 0.02, 0.08
 _SINGULAR = 1e-7
 # Least cosine of the angle by which the tangent of a curve turns in one step.
 _TURN = 0.98
-# If this cosine is exceeded, the next step is longer.
+# If the cosine of this angle is above this value, the next step is longer.
 _STRAIGHT = 0.995
 # A posture belongs to a node only if its distance from the tangent space of the node is at most this fraction of its
 # distance from the node.
@@ -40,8 +40,9 @@ _APART = 0.7
 # Number of directions in which steps from a node of a surface are tried.
 _DIRECTIONS = 8
 # Radius that a node of a surface covers, as a fraction of the step.  The direction to any point one step away differs
-# from a tried direction by at most half the angle between tried directions.  This bounds the distance from the point
-# to a tried point.  Each tried point lies within ``_APART`` of a node, and the radius is the sum of both distances.
+# from a tried direction by at most half the angle between tried directions.  This angle bounds the distance to a
+# tried point.  The distance from a tried point to a node is at most ``_APART``.  The radius is the sum of these two
+# distances.
 COVERED = _APART + 2 * np.sin(np.pi / _DIRECTIONS / 2)
 _BATCH = 100
 
@@ -161,7 +162,7 @@ def _component_of(manifold: ConstraintManifold, dimension: int, components: Sequ
 
 
 def _embedded(manifold: ConstraintManifold, x: Array, basis: Array) -> Array:
-    """Map each tangent vector of a basis to the unit direction of the embedded point, shape (N, d, k)."""
+    """Return the directions of the embedded points for motions along the vectors of a basis, shape (N, d, k)."""
     size = 1e-6
     here = manifold.embed(x)
     moved = [(manifold.embed(manifold.move(x, size * v)) - here) / size for v in basis.transpose(1, 0, 2)]
@@ -225,8 +226,8 @@ def _surface(manifold: ConstraintManifold, x: Array) -> Component:
     """Cover the surface through a posture with nodes, by an advancing front.
 
     From each node, points one step away are tried in all directions of its tangent plane.  A point that is far from
-    all nodes becomes a node.  Nodes beyond the limits by less than a step are added to cover the rim of the surface.
-    The front does not continue from nodes beyond the limits.
+    all nodes becomes a node.  Nodes less than a step beyond the limits are included, so that the nodes cover the
+    surface up to the limits.  The front does not continue from nodes beyond the limits.
     """
     from scipy.spatial import cKDTree
 

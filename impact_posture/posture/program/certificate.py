@@ -135,10 +135,10 @@ def certify(
 
 
 def objective_gradients(problem: ConstrainedProblem, q: Array, scale: float) -> tuple[Array, Array]:
-    """Return the gradients, shape (k, nv), and the gaps, shape (k,), of :class:`Subgradients`, divided by the scale.
+    """Return the gradients, shape (k, nv), and the gaps, shape (k,), of :class:`Subgradients`, divided by ``scale``.
 
     The gradients include the regularization.  Their convex combinations are the subdifferential of the function that
-    is minimized.  If this function is smooth at ``q``, k = 1.
+    is minimized.  If the minimized function is smooth at ``q``, k = 1.
     """
     members = problem.objective.subgradients(q, _TIED * scale)
     gradients = members.gradients / scale

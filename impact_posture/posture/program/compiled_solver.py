@@ -23,7 +23,8 @@ from impact_posture.system.toolchain import find_compiler, require_compiler, run
 CompileMode = Literal["auto", "always", "never"]
 
 # The times are measured with docs/studies/solve.py for talos.  Compiling 170,000 operations takes about 20 s.  A run
-# of about 25 iterations is then about 30 ms faster.  The decision depends only on the orders of magnitude.
+# of about 25 iterations is then about 30 ms faster.  For the decision whether to compile, the orders of magnitude of
+# these times suffice.
 _COMPILE_S_PER_OPERATION = 1.2e-4
 _SAVED_S_PER_OPERATION = 6e-9
 _ITERATIONS = 35

@@ -1,8 +1,8 @@
 """Call IPOPT with suitable options and with one thread for linear algebra, and let Ctrl-C stop the solver.
 
-NumPy, SciPy and CasADi (for MUMPS in IPOPT) each bring a BLAS that uses all cores.  The systems here have about a
-hundred unknowns, so these threads only wait for each other and block the cores of parallel starts.
-:func:`one_blas_thread` prevents this.
+NumPy, SciPy and CasADi (for MUMPS in IPOPT) each bring a BLAS that uses all cores.  The linear systems have about a
+hundred unknowns.  For systems this small, the threads of a BLAS only wait for each other and block the cores of
+parallel starts, so :func:`one_blas_thread` limits each BLAS to one thread.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ WARM_OPTIONS = {"ipopt.warm_start_init_point": "yes"} | {
 
 
 class _CasadiOpenBLAS(threadpoolctl.OpenBLASController):  # type: ignore[misc]
-    """Controller for the OpenBLAS library in the CasADi wheels, which has a different file name."""
+    """Thread controller for the OpenBLAS in the CasADi wheels, whose file name threadpoolctl does not know."""
 
     internal_api = "casadi_openblas"
     filename_prefixes = ("libcasadi-tp-openblas",)
@@ -74,14 +74,14 @@ def one_blas_thread() -> Iterator[None]:
 
 @cache
 def _libraries() -> threadpoolctl.ThreadpoolController:
-    ca.has_nlpsol("ipopt")  # Load IPOPT and its BLAS: the controller sees only loaded libraries.
+    ca.has_nlpsol("ipopt")  # Load the BLAS of IPOPT, which is visible only then.
     return threadpoolctl.ThreadpoolController()
 
 
 def run_solver(solver: ca.Function, **arguments: Array) -> dict[str, ca.DM]:
     """Call an ``nlpsol``; after a Ctrl-C, raise ``KeyboardInterrupt`` when the call returns.
 
-    IPOPT may treat the interrupt as a failed evaluation and ignore it.
+    IPOPT may treat a Ctrl-C as a failed evaluation and ignore it.
     """
     seen: list[int] = []
 

@@ -106,7 +106,7 @@ class PostureNLP:
         return nlp
 
     def grown(self, problem: ConstrainedProblem, *, compile: CompileMode = "auto") -> PostureNLP:
-        """Build the program of ``problem``, which is the problem of this program with additional rows."""
+        """Build the program of ``problem``, which is :attr:`problem` with additional rows."""
         return build_nlp(problem, compile=compile, program=self.program)
 
     def solve(
@@ -136,7 +136,7 @@ class PostureNLP:
         return replace(again, iterations=record.iterations + again.iterations, time_s=record.time_s + again.time_s)
 
     def _cold(self, start: Array, scale: float, attempt: int) -> WarmStart:
-        """Return initial values for a run without multipliers."""
+        """Return initial values of all unknowns, without multipliers."""
         problem, unclipped = self.problem, self.chart.to_x(start)
         x = np.clip(unclipped, problem.lower, problem.upper)
         # Use ``start`` itself if possible, because the impact quantities at ``start`` are usually cached.

@@ -67,7 +67,7 @@ class Program:
         joint = joined(self.fixed, self.rows.derivatives(rows), self.chart.nx)
         # The rows of ``joint`` are, in this order, the objective value, the quaternion norms, the rows of the
         # objective, and the rows of the constraints. In ``g``, the rows of the constraints come directly after the
-        # norms.
+        # quaternion norms.
         norms, count, fixed = self.rows.norms.numel(), rows.rows.numel(), self.fixed.multipliers.numel()
         order = [*range(1, 1 + norms), *range(fixed, fixed + count), *range(1 + norms, fixed)]
         return symbols, joint.reordered(order).options(x, self.parameters, joint.multipliers[0], g)

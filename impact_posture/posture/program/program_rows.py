@@ -1,7 +1,7 @@
-"""The rows of all constraints of a program to which rows can be added; each piece is differentiated once.
+"""The rows of all constraints of a program that can grow; the parts of each constraint are differentiated once.
 
-First and second derivatives take most of the time to build a program.  When rows are added, most pieces stay the
-same, so their derivatives are reused.
+First and second derivatives take most of the time to build a program.  When rows are added, most parts stay the same,
+so their derivatives are reused.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ class Derivatives:
         return Derivatives(multipliers, ca.jacobian(rows, unknowns), hessian)
 
     def reordered(self, rows: list[int]) -> Derivatives:
-        """Return the derivatives with these rows in this order; the Hessian still contains all multipliers."""
+        """Return the derivatives of ``rows``, in this order; the Hessian still contains all multipliers."""
         return Derivatives(self.multipliers[rows], self.jacobian[rows, :], self.hessian)
 
     def options(self, x: ca.SX, p: ca.SX, price: ca.SX, g: ca.SX) -> dict[str, ca.Function]:
-        """Return options of ``nlpsol`` that supply these derivatives of ``g``; ``price`` is the multiplier of f.
+        """Return options of ``nlpsol`` that supply the derivatives of ``g``; ``price`` is the multiplier of f.
 
         In a compiled library, CasADi identifies the derivatives by the names of functions, inputs and outputs.
         """

@@ -33,8 +33,8 @@ _DRAWN = 200
 # Number of starts that confirm a conflict known from a nearby target. For panda in front of a wall, two starts are
 # needed to find a way around a body.
 _CONFIRMING = 4
-# Number of random postures that are drawn first. This number usually suffices, and drawing all takes longer than
-# solving the program of a small robot.
+# Number of random postures that are drawn first.  These postures usually suffice, and drawing all ``_DRAWN`` postures
+# takes longer than solving the program of a small robot.
 _DRAW = 8
 # Maximum number of times that missing rows are added to the program for one start.
 _ROUNDS = 20
@@ -68,8 +68,8 @@ def find_conflicts(
     """Minimize the slack ``Σ (s⁺ + s⁻)`` with ``c(q) + s⁺ − s⁻`` within bounds, from ``guesses`` and other starts.
 
     ``program`` may belong to the same problem with another target or with fewer rows.  ``beside`` is the least
-    violation known from a nearby target.  If the first few starts reduce the violation below half of ``beside``, the
-    other starts run too; otherwise the search stops.
+    violation that a search found for a nearby target.  The search stops after :data:`_CONFIRMING` starts if the least
+    violation so far is at least half of ``beside``.
     """
     chart = Chart.of(problem.robot.model)
     program = program or ElasticProgram(problem)
@@ -157,7 +157,7 @@ class ElasticProgram:
         f = ca.dot(price, up + down) + _SLACK_PRICE * lifted.slack + self._away
         known = self._rows.derivatives(lifted)
         slacks = ca.horzcat(place, -place)
-        # The slacks stand between x and the auxiliary unknowns in the vector of unknowns. The rows are linear in the
+        # The vector of unknowns contains x, then the slacks, then the auxiliary unknowns.  The rows are linear in the
         # slacks.
         hessian, others = ca.SX(nx + 2 * k + z, nx + 2 * k + z), [*range(nx), *range(nx + 2 * k, nx + 2 * k + z)]
         hessian[others, others] = known.hessian

@@ -185,7 +185,7 @@ def _compared(before: PostureSolution, after: PostureSolution) -> tuple[float, f
 def _improved(
     before: PostureSolution, guesses: Sequence[Array], *, seed: int, jobs: int, compile: CompileMode
 ) -> PostureSolution:
-    """Solve from ``guesses``; return the better of both solutions, with the statistics of ``before``."""
+    """Solve from ``guesses``; return this solution if it is better than ``before``, and otherwise ``before``."""
     try:
         count = 1 + len(guesses)
         after = solve(before.problem, starts=count, seed=seed, jobs=jobs, compile=compile, guesses=guesses)

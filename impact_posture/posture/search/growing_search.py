@@ -32,10 +32,10 @@ _ROUNDS = 10
 # If all starts together have at most this number of unknowns, every start is finished, because stopping starts would
 # save no time.
 _SMALL = 1000
-# Largest number of unknowns of all starts that continue together.  With more starts, the program would get rows that
+# Largest total number of unknowns of the starts that run together.  With more starts, the program would get rows that
 # the best starts do not need.
 _BATCH = 600
-# Least number of starts that continue together.  With fewer starts, the program would be built more often.
+# Least number of starts that run together.  With fewer starts, the program would be built more often.
 _LEAST = 2
 # A start is dominated, and stops, if its objective exceeds the best objective by this fraction.  The fraction is
 # large because the repetition of a trapped run (:attr:`SolverRun.trapped`) may end at a lower objective.
@@ -66,9 +66,9 @@ class SolverRun:
         certificate: Certificate of the final posture; ``None`` while the program lacks rows.
         lacks: Whether the final posture violates rows that the program lacks.
         dominated: Whether the start was stopped after this run because it could not become the best.
-        trapped: Whether the final posture violates a constraint although more rows would not help.  Either no rows
-            are missing, or slack lowers the objective by more than the penalty.  A trapped run is repeated with a
-            higher penalty on slack.
+        trapped: Whether the final posture violates a constraint although more rows would not help.  More rows do not
+            help if the program already has all rows, or if slack lowers the objective by more than the penalty.  A
+            trapped run is repeated with a higher penalty on slack.
         time_s: Wall time of all runs from the start, s; the time of a run for several starts is divided equally among
             them.
     """
@@ -142,15 +142,15 @@ class GrowingSearch:
     def run(self, jobs: int, progress: Progress | None) -> list[SolverRun]:
         """Run all starts; if the program lacks rows at a final posture, run again from this posture.
 
-        The objective at such a final posture is a lower bound for the start, because additional rows raise the
-        objective.  Starts with the lowest bounds continue first.  Starts whose bounds are well above the objective of
-        a certified posture do not continue.
+        The objective at such a final posture is a lower bound of the final objective of the start, because additional
+        rows raise the objective.  Starts with the lowest bounds continue first.  Starts whose bounds are well above
+        the objective of a certified posture do not continue.
         """
         runs: dict[int, SolverRun] = {}
         starts, best = self._draws.count, np.inf
         waiting, counts = list(range(starts)), [0] * starts
-        # Results at which the program lacks rows, with the problem of their run. When the start continues, the
-        # missing rows are added to the program.
+        # Results at which the program lacks rows, with the problem of their run.  Before the next run from the same
+        # start, the missing rows are added to the program.
         owed: dict[int, tuple[SolveRecord, ConstrainedProblem]] = {}
         while waiting:
             batch = self._next(waiting, runs)
@@ -171,7 +171,8 @@ class GrowingSearch:
             # penalty on slack, a run stays within the constraints that its start satisfies.
             trapped = {k for k in batch if runs[k].trapped and k not in last}
             if len(runs) < starts and trapped == {*range(FIRST)}:
-                # In all first starts, penetrating a body lowers the objective by more than the penalty on the slack.
+                # In the runs from all first starts, penetrating a body lowers the objective by more than the penalty
+                # on the slack.
                 self._price = HIGH_PRICE
             self._trapped.update(trapped)
             owed |= {k: (r, self.problem) for k, r in lacking.items()}
@@ -185,8 +186,8 @@ class GrowingSearch:
         return [runs[index] for index in range(starts)]
 
     def _grow(self, owed: list[tuple[SolveRecord, ConstrainedProblem]]) -> None:
-        """Add the rows that the program lacks at the results ``owed``, each given with the problem of its run."""
-        # Auxiliary unknowns can be used only with the program of their run.
+        """Add the rows that the program lacks at results, which are given with the problem of their run."""
+        # The auxiliary unknowns of a result are valid only for the program that was solved.
         now = [record for record, problem in owed if problem is self.problem]
         before = [record.q for record, problem in owed if problem is not self.problem]
         numeric = self.nlp.program.numeric

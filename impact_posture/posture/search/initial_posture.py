@@ -23,14 +23,14 @@ from impact_posture.posture.search.conflicts import ElasticProgram, LeastViolati
 from impact_posture.posture.search.growing_search import feasible
 from impact_posture.system.arrays import Array
 
-# If ``beside`` has this small value, :func:`find_conflicts` stops after a few starts when a conflict remains.
+# With this value of ``beside``, :func:`find_conflicts` gives up after a few starts.
 _QUICK = 1e-9
-# Clearance (m) of the problem that shows whether the clearance is the reason of a conflict.
+# Clearance, m, that is tried in order to find out whether the stated clearance causes a conflict.
 _LEAST_CLEARANCE = 1e-4
 # If no posture allows the speed of a strike, the required speed is below the greatest speed by this fraction, so that
 # the program has an interior.
 _SLOWER = 1e-3
-# Shares of the tilt and shift of the surface of a strike that the program tries to require.
+# Fractions of the stated tilt and shift of the surface that are required in turn until a posture satisfies them.
 _SHARES = (1.0, 0.5, 0.0)
 # A greatest speed below this fraction of the stated speed is a conflict.
 _LEAST_SPEED = 0.01
@@ -41,8 +41,8 @@ _BISECTIONS = 8
 def initial_posture(problem: ConstrainedProblem, seed: int) -> tuple[ConstrainedProblem, Array, ProgramRows]:
     """Return the problem, a posture from which the search begins, and the rows of the program.
 
-    If no posture keeps clear of the surfaces of a strike in all its places (:class:`SpreadClearance`), the returned
-    problem requires only a share of the tilt and shift.
+    If no posture keeps clear of the surfaces for the stated tilt and shift (:class:`SpreadClearance`), the returned
+    problem requires only a fraction of this tilt and shift.
 
     Raises:
         Infeasible, SolverFailed: The same errors as in :func:`_initial_posture`.
@@ -59,7 +59,7 @@ def initial_posture(problem: ConstrainedProblem, seed: int) -> tuple[Constrained
 
 
 def _with_spreads(problem: ConstrainedProblem) -> Iterator[ConstrainedProblem]:
-    """Yield the problem with smaller and smaller tilts and shifts of the surfaces of a strike, the last without."""
+    """Yield the problem with smaller and smaller tilt and shift of the surfaces, down to zero."""
     spread = next((c for c in problem.constraints if isinstance(c, SpreadClearance)), None)
     if spread is None or problem.surroundings is None:
         yield problem
@@ -83,8 +83,7 @@ def _initial_posture(
 
     If the start still violates constraints that the projection ignores, :class:`ElasticProgram` moves the start.  The
     returned problem then has all rows that this program needed.  If no posture allows the speed of a strike, the
-    returned problem requires the greatest possible speed instead, unless ``beside`` is given
-    (:func:`find_conflicts`).
+    returned problem requires the greatest possible speed instead, unless ``beside`` is above zero.
 
     Raises:
         Infeasible: No posture satisfies the constraints; the error names the conflicting constraints.
@@ -125,7 +124,7 @@ def _initial_posture(
 
 
 def _slowed(least: LeastViolation, seed: int, program: ElasticProgram) -> LeastViolation:
-    """Return a posture without conflicts at the greatest approach speed, or ``least`` if the speed is not the reason.
+    """Return a posture for the greatest approach speed, or ``least`` if the speed does not cause the conflict.
 
     If other constraints, such as clearances, conflict with the speed, the penalties do not show the greatest speed.
     Bisection then finds this speed.

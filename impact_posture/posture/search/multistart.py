@@ -120,9 +120,9 @@ def solve(
 
     ``starts`` is the least number of starts, because the given posture and all guesses are always starts.  ``seed``
     is the seed of the random postures.  ``progress`` is called with the numbers of finished starts and of all starts.
-    ``finish_all`` also finishes starts that can no longer become the best.  If ``screened`` is not 0, at most this
-    number of random postures is screened (:mod:`impact_posture.posture.search.screening`), and the best are the
-    starts, instead of random postures.
+    ``finish_all`` also finishes starts that can no longer become the best.  If ``screened`` is not 0, the search
+    screens at most ``screened`` random postures (:mod:`impact_posture.posture.search.screening`).  The best screened
+    postures then replace the random postures as starts.
 
     Raises:
         Infeasible: No posture satisfies the constraints; the error names the conflicting constraints.
@@ -259,7 +259,7 @@ def distinct(
 def hits_of_best(optima: Sequence[Optimum]) -> int:
     """Return how many starts reached the best objective.
 
-    The postures of these starts are not compared, because postures on a flat optimum differ.
+    Only objectives are compared, because the final postures of starts on a flat optimum differ.
     """
     best = optima[0].objective
     return sum(o.hits for o in optima if o.objective - best <= _SAME_OBJECTIVE * abs(best))

@@ -38,9 +38,9 @@ _LEAST = 16
 # If less than this fraction of the first random postures reaches the equalities, the descents end at too similar
 # postures.  Descents then also begin from starts that satisfy all constraints.
 _REACHED = 0.4
-# Number of starts that satisfy all constraints.
+# Number of such starts.
 _FEASIBLE = 128
-# Largest number of these starts, as a fraction of all allowed descents.
+# Largest number of descents from such starts, as a fraction of all allowed descents.
 _PART = 1 / 8
 # Share of the new descents that are hops.
 _HOPPING = 0.75
@@ -49,7 +49,7 @@ _HOPPING = 0.75
 _RANKED, _TIRED = 0.7, 8
 # A hop gives other values to one of these shares of the joints, rounded up.
 _REDRAWN = (0.1, 0.2, 0.3, 0.5)
-# Share of the hops that take these values from another optimum.  The other hops draw random values.
+# Share of the hops that take the other values from another optimum.  All other hops draw random values.
 _CROSSED = 0.6
 # Distance (rad, m) below which two final postures are the same optimum if their merits differ by less than
 # ``SAME_VALUE``.
@@ -57,15 +57,15 @@ _SAME = 0.05
 # The search stops when this number of random postures and hops from worse final postures reached the best merit, and
 # if ``_FREE``, ``_ENDS`` and ``_IDLE`` allow it.
 _HITS = 12
-# Degrees of freedom up to which ``_HITS`` suffices.  Each further degree doubles the number, because the number of
-# optima grows exponentially with the degrees of freedom.
+# Degrees of freedom up to which ``_HITS`` suffices.  Each further degree of freedom doubles the number of hits,
+# because the number of optima grows exponentially with the degrees of freedom.
 _FREE = 5
 # The search stops only after this number of descents has ended.
 _ENDS = 256
 # The search stops only if the last descents, this fraction of all ended descents, did not lower the best merit.
 _IDLE = 0.5
 # Number of starts of IPOPT: half of them at the best final postures, half at the most different good final postures.
-# If descents ignored no constraint, a third suffices.
+# If descents ignored no constraint, a third of this number suffices.
 _GUESSES = 12
 # Limit of the number of starts times the degrees of freedom, because a solution takes longer for large robots.
 _SOLVED = 200
@@ -124,8 +124,8 @@ class _Search:
         self._manifold = self.descent.manifold
         self.ends = Ends(np.zeros((0, self._manifold.chart.nx)), np.zeros(0), np.zeros(0, dtype=int))
         self._problem, self._initial, self._rng = problem, initial, np.random.default_rng([seed, 2])
-        # For each optimum: the index of a descent that ended there, the merit and the embedded posture of this end,
-        # the number of random postures that reached the optimum, and the number of hops from the optimum.
+        # One entry per optimum: index of a descent that ended there, merit and embedded posture at its end, number of
+        # random postures that reached the optimum, and number of hops from the optimum.
         self._end, self._merit = np.zeros(0, dtype=int), np.zeros(0)
         self._points = np.zeros((0, self._manifold.embed(self.ends.x).shape[1]))
         self._hits, self._tries = np.zeros(0, dtype=int), np.zeros(0, dtype=int)
@@ -174,7 +174,7 @@ class _Search:
         return hits >= enough and bool(best.argmax() < (1 - _IDLE) * len(merit))
 
     def result(self) -> Screening:
-        """Return the result: the guesses, their hits, and the hits of all optima."""
+        """Choose the guesses for IPOPT, and count the hits of all optima."""
         order = np.argsort(self._merit, kind="stable")
         projector, guesses = Projector(self._problem), dict[int, Array]()
         partial = not all(isinstance(c, ExpressionConstraint) for c in self._problem.constraints)
@@ -191,7 +191,7 @@ class _Search:
         )
 
     def _hop(self, other: Array) -> tuple[Array, NDArray[np.int_]]:
-        """Return final postures with some joints from others or from ``other``, shape (N, nx), and their indices."""
+        """Return hops, shape (N, nx), and the descents that they start from; ``other`` are random postures."""
         rng, count = self._rng, len(other)
         rank = np.argsort(np.argsort(self._merit))
         weight = (1 + rank) ** -_RANKED / (1 + self._tries / _TIRED) ** 2

@@ -19,7 +19,7 @@ from impact_posture.system.escape import toml
 # A direction is lost if the joints move the constrained frame along it by less than this fraction of the largest
 # motion.
 _LOST = 1e-3
-# A direction is nearly lost up to this fraction of the largest motion.
+# A direction is nearly lost if the motion along it is below this fraction of the largest motion.
 _CLEAR = 5e-3
 # Angle by which joints are bent, rad.
 _BEND = 0.5
@@ -35,8 +35,8 @@ class SingularTarget:
 
     Attributes:
         rank: Largest rank of the Jacobian of the constraint at the given postures.
-        full_rank: Rank of this Jacobian at random postures.
-        bent: Joint positions at which the rank is full, rad; empty if the target is stated by the user.
+        full_rank: Rank of the Jacobian of the constraint at random postures.
+        bent: Joint positions at which the rank is ``full_rank``, rad; empty if the user stated the target.
     """
 
     name: str
@@ -61,7 +61,7 @@ class SingularTarget:
 
 
 def singular_target(problem: ConstrainedProblem, postures: Sequence[Array]) -> SingularTarget | None:
-    """Return the first pose that is singular at all ``postures``, shape (nq,) each, or ``None``."""
+    """Return the first pose constraint that is singular at all ``postures``, shape (nq,) each, or ``None``."""
     model, random = problem.robot.model, np.random.default_rng(0)
     others = [pin.integrate(model, problem.given, random.uniform(-1, 1, model.nv)) for _ in range(_SAMPLES)]
     for constraint in (c for c in problem.constraints if c.equality):

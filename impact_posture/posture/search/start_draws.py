@@ -12,8 +12,8 @@ class StartDraws:
 
     Random starts are drawn as in :func:`impact_posture.posture.manifold.feasible_start.feasible_start`.
 
-    Each start is drawn in the process that runs it.  The constraints on the starts stay the same when rows are added
-    to the program. There is at least one known start.  Every second random start lies near the first known start,
+    The process that runs a start also draws it.  The constraints on the starts stay the same when rows are added to
+    the program.  ``known`` contains at least one start.  Every second random start lies near the first known start,
     because the posture of the problem may be far from all postures that satisfy the constraints.
     """
 
@@ -22,7 +22,7 @@ class StartDraws:
         self._problem, self._seed, self._projector = problem, seed, Projector(problem)
 
     def choose(self, index: int, trapped: int = 0) -> Array | None:
-        """Return the start with this index, shape (nq,); ``None`` if no attempt reached the constraints.
+        """Return start number ``index``, shape (nq,); ``None`` if no attempt reached the constraints.
 
         ``trapped`` is the number of trapped runs (:attr:`SolverRun.trapped`) from this start.  After the first
         trapped run, the start is chosen from more candidates.  If further runs from the start are trapped, another

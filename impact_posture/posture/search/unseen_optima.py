@@ -62,7 +62,7 @@ class SearchEstimate(JsonBlock):
         elsewhere = f"{near} {_percent(self.unseen_share)}" if self.unseen_share else f"fewer than {_percent(most)}"
         hops = f" and {self.hops} hops" if self.hops else ""
         starts = "1 start" if self.starts == 1 else f"{self.starts} starts"
-        ignored = " if they ignore clearances and loads" if self.partial else ""
+        ignored = " if these starts ignore clearances and loads" if self.partial else ""
         reached = f"{starts}{hops} reached optima with {optima}, the best {times}"
         return f"{reached}; {elsewhere} of further starts would lead to another objective{ignored}"
 
@@ -96,7 +96,7 @@ def unseen_share(hits: Sequence[int]) -> float:
 
 
 def estimated_optima(hits: Sequence[int]) -> float:
-    """Estimate the number of optima, seen and unseen, from the hits of each; the estimate tends to be too low.
+    """Estimate the number of optima, seen and unseen, from the hits of each seen optimum; tends to be too low.
 
     This is the bias-corrected Chao1 estimate ``n + f₁(f₁ − 1)/(2(f₂ + 1))`` with the numbers ``f_k`` of optima with k
     hits (A. Chao, "Nonparametric estimation of the number of classes in a population", Scand. J. Statist. 1984).
