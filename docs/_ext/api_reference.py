@@ -15,7 +15,7 @@ ROOT = "impact_posture"
 
 
 def modules(name: str) -> list[str]:
-    """Return a module, or the public modules of a package.  A package that exports names comes first."""
+    """Return a module, or the public modules of a package.  The package comes first if it exports names itself."""
     full = f"{ROOT}.{name}"
     package = import_module(full)
     if not hasattr(package, "__path__"):

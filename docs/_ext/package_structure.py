@@ -21,7 +21,9 @@ SUFFIXES = {".py", ".c", ".cpp", ".hpp"}
 
 
 def part_of(module: str) -> str:
-    """Return the folder or module of the library to which a dotted name belongs.  The command line is one part."""
+    """Return the folder or module of the library to which a dotted name belongs.  The whole command line counts as
+    one part, ``cli``.
+    """
     names = module.split(".")
     if names[0] == "impact_posture_cli":
         return "cli"

@@ -27,8 +27,9 @@ DT, DURATION, AT_REST = 0.01, 10.0, 1e-5  # time step, s; longest run, s; norm o
 class ImpactTask(mink.Task):
     """Task ``Δq = −K ∇f(q) Δt``, with the error ``K ∇f Δt`` and the identity as Jacobian.
 
-    ``f`` is the objective of an export, such as the effective mass or H.  ``speed`` is the norm of v at the first
-    tick, which gives K.  The robot must have a fixed base, and the joints of both models must have the same order.
+    ``f`` is the objective of an export, such as the effective mass or H.  The gain K is chosen so that the norm of v
+    at the first tick equals ``speed``.  The robot must have a fixed base, and the joints of both models must have
+    the same order.
     """
 
     def __init__(self, gradient: ip.ImpactGradient, speed: float, q: np.ndarray) -> None:

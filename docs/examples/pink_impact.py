@@ -35,8 +35,8 @@ DT, DURATION, AT_REST = 0.01, 60.0, 1e-6  # time step, s; longest run, s; norm o
 class ImpactTask(Task):
     """Task ``Δq = −K ∇f(q) Δt``, with the error ``K ∇f Δt`` and the identity as Jacobian, both on the tangent space.
 
-    ``f`` is the objective of an export, such as H or the effective mass.  Its size depends on the robot.  So the norm
-    of v at the first tick is given instead of K.
+    ``f`` is the objective of an export, such as H or the effective mass.  The size of ``f`` depends on the robot.
+    So the argument ``speed``, the norm of v at the first tick, determines K.
     """
 
     def __init__(self, gradient: ImpactGradient, speed: float, q: np.ndarray) -> None:

@@ -93,7 +93,7 @@ def timed(command: list[str]) -> Run:
 
 
 def _read(terminal: int) -> bytes:
-    """Read the output of a terminal.  At the end, where Linux reports an error, return no bytes."""
+    """Read the output of a terminal.  Return no bytes at the end of the output, which Linux reports as an error."""
     try:
         return os.read(terminal, 1 << 16)
     except OSError:

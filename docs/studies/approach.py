@@ -20,7 +20,7 @@ _SHARE = 0.9
 def lines(request: Request) -> Iterator[str]:
     """Yield a row for each normal and each robot whose joints move the contact to the surface."""
     yield f"Fastest approach speed at the start and in the best optimum of {STARTS} starts, with constraints on"
-    yield f"collisions and motor limits. Then the optimum if {_SHARE:.0%} of the speed at the start is required."
+    yield f"collisions and motor limits. Last columns: the optimum if {_SHARE:.0%} of the start speed is required."
     yield "*loss*: increase of the objective by this requirement. *a start*: median time of a start, divided by"
     yield "the median without the requirement. Flying robots and contacts on the trunk have no speed limit."
     yield "Robots without a collision-free posture have no row."

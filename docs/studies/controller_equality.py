@@ -87,7 +87,7 @@ class Agreement:
         differ: Number of solved ticks whose controls differ by more than 1e-9.
         own: Largest relative change of the Python controls in the solved ticks if the last digits of the QP change.
         relaxed: Number of ticks that both controllers relaxed.
-        other: Number of ticks with different statuses, by ``Python/C``.
+        other: Number of ticks with different statuses, keyed by ``Python/C``.
         held: Number of ticks in which the controller in C failed and repeated its last command.
         off: Largest violation and residual of optimality in the certified ticks; rows: C, Python.
         wrong: Number of certified ticks in which the answer of C, or of Python, is wrong.
@@ -163,7 +163,9 @@ def agreement(name: str, kind: str, ticks: int) -> Agreement:
 
 
 def _compare(tally: Agreement, ours: Controller, a: Command, b: Command) -> None:
-    """Add a tick to the agreement.  Certify both solutions if they differ, and in every SOME-th relaxed tick."""
+    """Compare the commands of one tick, and add the result to ``tally``.  Certify both solutions if they differ, and
+    in every SOME-th relaxed tick.
+    """
     answered, certify = (Status.SOLVED, Status.RELAXED), a.status is not b.status
     tally.held += b.status not in answered
     if certify:

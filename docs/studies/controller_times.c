@@ -1,6 +1,6 @@
 /* Measures each tick of an exported controller over the recorded states of a file (NQ + NV numbers each).
- * Arguments: the file; then "cold" to flush the caches before each tick, or a number to switch on the impact-robust
- * term, whose gradient is then evaluated every so many ticks.  Prints a line for each tick: nanoseconds, status,
+ * Arguments: the file; then "cold", which flushes the caches before each tick, or a number N, which switches on the
+ * impact-robust term and evaluates its gradient in every N-th tick.  Prints a line for each tick: nanoseconds, status,
  * iterations and, with the term, the nanoseconds of its gradient. */
 #define _POSIX_C_SOURCE 199309L
 #include <stdio.h>

@@ -16,7 +16,7 @@ from impact_posture.codegen.export import export
 from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.system.libraries import library_path
 
-# Robots with feet on the ground, and the goal for both times, µs.
+# Robots with feet on the ground, and the goal for the time with supports and without supports, µs.
 _FEET = {"solo8, four feet": "–", "solo12": "–", "g1": "–", "talos, two feet": "2.5"}
 _LOADED = ("tilthex_arm", "solo8, four feet", "panda")
 _ROUNDS = 61

@@ -1,7 +1,7 @@
 /* Courses of the reference flow.  Append this file to the source of an exported controller with the prefix "course".
  * The robot follows exactly, and no command except the first is computed. */
 
-/* Number of values in a row of course_run, with the posture. */
+/* Number of values in a row of course_run, including the posture. */
 enum { COURSE_ROW = 4 + COURSE_NQ };
 
 static void course_row(const course_context *c, double *row)

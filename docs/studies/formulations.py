@@ -1,6 +1,7 @@
 """Compare two forms of the nonlinear program.
 
-In the lifted form, the impact equations are constraints.  In the reduced form, the objective function solves them.
+In the lifted form, the impact equations are constraints.  In the reduced form, the objective function solves these
+equations.
 
 IPOPT solves both forms with exact Hessians from the same starts, without compiled code.
 """

@@ -11,7 +11,7 @@ from impact_posture.collision.contact_front import ContactFront, contact_front
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import known_robots, load_robot
 
-# Contact frame → axis of this frame along which the tool points.  A base has no such axis, because it may be pushed
+# Contact frame → axis of this frame along which the tool points.  A base has no such axis, because a push can come
 # from every side.
 FORWARD = {
     "anymal_kinova": {"j2s6s200_end_effector": "x"},
@@ -32,7 +32,7 @@ FORWARD = {
 
 
 def front(robot: Robot, frame: str, axis: str) -> ContactFront:
-    """Return the front of a contact frame along an axis of the frame, such as ``-z``, from its contact point."""
+    """Return the foremost point of the contact link along an axis of the contact frame, such as ``-z``."""
     direction = np.eye(3)["xyz".index(axis[-1])] * (-1 if axis.startswith("-") else 1)
     offset = robot.spec.contact.offset_of(frame)
     measured = contact_front(robot, robot.posture(), frame, offset, direction, robot.held)

@@ -20,7 +20,7 @@ _MAPPED = [
     Case(f"{robot}, {name}", robot, normal)
     for robot in (*_GOALS, "z1", "kinova", "tiago", "borinot")
     for name, normal in (("down", DOWN), ("ahead", AHEAD))
-    # Leave out borinot with an impact ahead, because it then has three degrees of freedom.
+    # Leave out borinot in front of a wall, because its constraints then leave three degrees of freedom.
     if (robot, name) != ("borinot", "ahead")
 ]
 _MAP = "case|degrees of freedom|components|objective|gap|word|patches|processor s|starts that missed it|runs that did"

@@ -53,7 +53,6 @@ class Place:
         motion: Motion in the impact windows, ``q_total_impact``.
         jump: Largest velocity jump, ``peak_jump``.
         force: Largest normal force, N.
-        status: Status of the run.
     """
 
     at: float
@@ -84,17 +83,17 @@ def _caption(scans: Mapping[str, Sequence[Place]]) -> Iterator[str]:
         best, last = min(fine, key=lambda p: p.H), fine[-1]
         most = max((p for p in fine if p.at < start.at), key=lambda p: p.motion)
         yield (
-            "Left, the arm over the floor, whose only redundancy is the bend of the elbow. H is lowest at "
+            "Left: the arm over the floor, with the bend of the elbow as its only redundancy. H is lowest at "
             f"{best.at:g} rad, where {_against(best, start)}. On the way there from the shipped "
             f"{start.at:g} rad, the motion at first changes by {percent(most.motion / start.motion - 1)} (at "
-            f"{most.at:g} rad). The other way, at {last.at:g} rad, H rises from {start.H:.0f} to {last.H:.0f}, and "
-            f"{_against(last, start)}."
+            f"{most.at:g} rad). In the other direction, at {last.at:g} rad, H rises from {start.H:.0f} to "
+            f"{last.H:.0f}, and {_against(last, start)}."
         )
     if HUMANOID in scans:
         fine = [p for p in scans[HUMANOID] if p.status == "completed"]
         start, end, most = fine[0], fine[-1], max(fine, key=lambda p: p.V)
         yield (
-            f"Right, the straight line of the humanoid from its start to the offline optimum, on its feet. √H falls "
+            f"Right: the humanoid on the straight line from its start to the offline optimum, on its feet. √H falls "
             f"to {math.sqrt(end.H / start.H):.2f} and the motion to {end.motion / start.motion:.2f}, while √V first "
             f"rises to {math.sqrt(most.V / start.V):.2f}: a push has an impulse, not a speed."
         )
@@ -117,7 +116,7 @@ def _scan(name: str, request: Request) -> list[Place]:
 
 
 def _places(name: str, count: int) -> Vector:
-    """Return the values of :attr:`Place.at` for the arm or the humanoid."""
+    """Return the values of :attr:`Place.at` at which the arm or the humanoid is simulated."""
     if name == HUMANOID:
         return np.linspace(0.0, 1.0, count)
     return np.unique(np.append(np.linspace(0.0, _LARGEST, count), _SHIPPED).round(6))

@@ -76,7 +76,7 @@ def arms(request: Request) -> Iterator[str]:
 
 
 def catalogue(request: Request) -> Iterator[str]:
-    """Yield the same lines for the robots of the catalogue."""
+    """Yield the results for the robots of the catalogue."""
     yield from _lines(request, _catalogue(request.only))
 
 
@@ -195,7 +195,7 @@ class _Known:
             self.lower(case, search().optima[0].objective)
 
     def lower(self, case: str, *objectives: float) -> None:
-        """Enter objectives that are lower than the best known one."""
+        """Record objectives that are lower than the best known objective."""
         best = min(self._best.get(case, np.inf), *objectives)
         if best != self._best.get(case):
             self._best[case] = best

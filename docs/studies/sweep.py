@@ -137,7 +137,7 @@ def killed_parent(file: Path, folder: Path, seed: int) -> int:
         if child.wait() == 0:
             if kills >= KILLS:
                 return kills
-            # The run ended too early: remove some shards, and continue.
+            # The run ended before it was killed often enough: remove some shards, and continue.
             for path in sorted(folder.glob("data/*/*.parquet"))[::2]:
                 path.unlink()
 

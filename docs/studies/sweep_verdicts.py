@@ -1,7 +1,7 @@
 """Compare the verdicts of a sweep with ``optimize``: ``python -m docs.studies.sweep_verdicts``.
 
 A sweep with 4 starts solves a grid of targets, and ``optimize`` with 16 starts solves each point alone.  If only one
-method certifies a point, the verdict of the other method is false.
+of the two methods certifies a point, the other method has missed it.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 // Repeatedly reads q, v, q_des, n, Kp, Kd, K from standard input.  Prints the posture acceleration, or the error code
-// if it does not exist.  A controller needs only the call in the loop.
+// if it does not exist.  A controller needs only the call of posture_acceleration in the loop.
 #include "posture_acceleration.hpp"
 
 #include <cstdio>

@@ -72,8 +72,8 @@ inline Tangent difference(const Configuration &a, const Configuration &b)
   return d;
 }
 
-// Returns the code of arm_eval.  Codes 1 and 2 (q or n is not valid) leave a unchanged: repeat the last command.
-// With code 3 (H does not exist at this q), a is computed without the gradient.
+// Returns the code of arm_eval.  With codes 1 and 2 (q or n is not valid), `a` keeps its value: repeat the last
+// command. With code 3 (H does not exist at this q), `a` is computed without the gradient.
 inline int posture_acceleration(const Configuration &q, const Tangent &v, const Configuration &q_des, const Vector3 &n,
   const Gains &gains, Tangent &a)
 {

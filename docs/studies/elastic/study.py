@@ -26,8 +26,8 @@ from tests.support.arms import TIP, seven_joints
 from tests.support.helpers import rng, unit
 
 SPEED = 0.5  # approach speed, m/s
-# Number of contact stiffnesses for each posture.  They are chosen such that x, computed with the compression time of
-# the links alone, is between 0.05 and 2.
+# Number of contact stiffnesses for each posture.  The stiffnesses are chosen such that x, computed with the
+# compression time of the links alone, is between 0.05 and 2.
 STIFFNESSES = 10
 LEAST, LARGEST = 0.05, 2.0
 # A normal is left out if the joints move the contact point along it by less than this value, m/rad.

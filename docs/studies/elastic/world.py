@@ -11,8 +11,8 @@ from impact_posture.dynamics.mjcf import build_mjcf, pose
 from impact_posture.impact.elasticity.elastic_impact import ElasticImpact
 from impact_posture.system.optional_package import import_mujoco
 
-# Mass (kg) and moments of inertia (kg m²) of the body of a rotor.  They are negligible, because the armature of the
-# rotor joint contains the inertia of the rotor.
+# Mass (kg) and moments of inertia (kg m²) of the body of a rotor.  These values are negligible, because the armature
+# of the rotor joint contains the inertia of the rotor.
 _TINY = 1e-9
 # Number of simulation steps from touch to greatest compression.
 STEPS = 4000

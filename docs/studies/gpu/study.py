@@ -13,7 +13,7 @@ from impact_posture.errors import InputError
 
 
 def lines(request: Request) -> Iterator[str]:
-    """Yield the lines that ``run.py`` prints, or the reason why it cannot run, which is not written as a page."""
+    """Yield the lines that ``run.py`` prints, or, without ``--write``, the reason why it cannot run."""
     folder = ROOT / "build" / "gpu"
     missing = [tool for tool in ("nvidia-smi", "nvcc", "gcc") if shutil.which(tool) is None]
     if missing and request.write:

@@ -41,7 +41,7 @@ SLIDERS = ("box_x", "box_y", "box_z")
 
 @dataclass(frozen=True, eq=False)
 class Arm:
-    """What the published model of the links does not contain.
+    """Properties of the recorded arm that the published model of its links does not contain.
 
     Attributes:
         mass: Mass that is added to link 7, kg; negative if the published mass is too large.
@@ -134,6 +134,8 @@ def elastic_response(arm: Arm, box: float, q: Vector) -> ElasticResponse:
 
 
 def with_duration(arm: Arm, box: float, q: Vector) -> Arm:
-    """Return the arm with the contact stiffness for which this box compresses for :data:`COMPRESSION`."""
+    """Return the arm with the contact stiffness for which a box of mass ``box`` compresses for
+    :data:`COMPRESSION`.
+    """
     mass = 1 / ImpactOracle(arm.case(box)).quantities(with_box(q)).G
     return replace(arm, stiffness=ContactStiffness(duration=COMPRESSION).linear_stiffness(mass, 1.0))

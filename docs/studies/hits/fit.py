@@ -14,7 +14,7 @@ from docs.studies.core import Vector
 from docs.studies.hits.arm import MASSES, MODELS, Arm, Model, with_box, with_duration
 from docs.studies.hits.recordings import AVERAGED, JOINTS, PERIOD, Group, Hit
 
-# Where the fit of the contact point starts, m.
+# Initial guess of the contact point in the fit, m.
 _START = (0.01, -0.03)
 # Unit in which the optimizer varies the contact point, m.
 _SCALE = 0.05
@@ -104,7 +104,8 @@ def fit_rotors(hits: Sequence[Hit]) -> Vector:
 
 
 def spring_deflection(hits: Sequence[Hit]) -> Vector:
-    """Return the deflection per torque ``1/K``, rad/(N·m), shape (7,), that the positions show besides the rotors.
+    """Return the deflection per torque ``1/K``, rad/(N·m), shape (7,), that the positions show in addition to the
+    rotors.
 
     The fit is ``Δq = −∬Δ(τ − u)/B dt² − Δτ/K``.
     """
@@ -149,7 +150,7 @@ def fit_contact(model: Model, arm: Arm, measured: Summary, *, at_tip: bool = Fal
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """All fits to one group, by default with the jumps without trend and controller."""
+    """All fits to one group of hits.  By default, the jumps do not contain the effects of trend and controller."""
 
     hits: Sequence[Hit]
     recorded: bool = False

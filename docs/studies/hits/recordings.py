@@ -42,8 +42,8 @@ _WEIGHT = 9.0
 _TREND = 6
 # Number of intervals that suffice for the fit.
 _ENOUGH = 3
-# Averaged intervals after the contact row by box.  The light box leaves the tip after some 10 ms, the heavy box after
-# some 25 ms.
+# Box → intervals after the contact row over which the velocity is averaged.  The light box leaves the tip after some
+# 10 ms, the heavy box after some 25 ms.
 AVERAGED = {1: (2, 4), 2: (5, 7)}
 
 
@@ -99,8 +99,8 @@ class Hit:
     def trend(self) -> tuple[Vector, Vector]:
         """Return the velocity (rad/s) in the last row before the contact, and the acceleration (rad/s²), shapes (7,).
 
-        A straight line is fitted to the velocities before the contact.  If the rows are few, the recorded velocity of
-        the first row replaces earlier rows.
+        A straight line is fitted to the velocities before the contact.  If fewer than :data:`_TREND` rows precede
+        the contact, the recorded velocity of the first row replaces the missing rows.
         """
         first = max(0, self.last_before - _TREND)
         times = np.arange(first, self.last_before) + 0.5

@@ -1,4 +1,4 @@
-"""Count the operations of H with ∇H in instructions of CasADi, and in the graph that becomes our C code."""
+"""Count the operations of H with ∇H, in instructions of CasADi and in the graph from which our C code is written."""
 
 from __future__ import annotations
 
@@ -35,8 +35,9 @@ def of_export(objective: WorstCaseObjective) -> tuple[Operations, int | None]:
     """Count the operations of one call of the exported ``eval``, without and with vector instructions.
 
     A call runs only the blocks that its outputs need, so only the reachable part of the graph is counted.  In the
-    second number, a vector instruction for all repeated limbs counts once, but each sine and cosine counts.  This
-    number is ``None`` without repeated limbs.  Ignoring the order of sums changes the count by at most 1 %.
+    second number, a vector instruction for all repeated limbs counts once, but each sine and cosine counts.  The
+    second number is ``None`` for a robot without repeated limbs.  Ignoring the order of sums changes the count by at
+    most 1 %.
     """
     exported = export_library([NamedObjective(objective, "kernel")])
     outputs = next(f.outputs for f in exported.functions if f.name == "eval")

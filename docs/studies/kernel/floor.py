@@ -3,8 +3,8 @@
 The count follows patterns of zeros, not values.  Each joint is a rotation in a coordinate plane of its link.
 Rotating a pair of numbers requires 4 multiplications and 2 additions (4m 2a).  A symmetric 2×2 matrix requires 4m 5a,
 and a general 2×2 matrix 4m 10a with the double angle (3m 2a for each joint).  A constant rotation that only permutes
-axes requires no operation; any other is counted as one more plane rotation.  Translations are cross products with the
-nonzero numbers.  Each joint requires:
+axes requires no operation; any other is counted as one more plane rotation.  A translation is a cross product with
+the nonzero entries of its vector.  Each joint requires:
 
 - factorization: the column ``U = I^A S``, one reciprocal, ``U/D``, and one triangle of ``I^a = I^A − U Uᵀ/D``, whose
   row of the joint axis is zero without armature.  ``I^a`` is rotated, moved by two products with ``p̂`` and added to
@@ -13,8 +13,8 @@ nonzero numbers.  Each joint requires:
   pass velocities outward;
 - gradient, for a and for b: the rows of ``f = I^a v⁻ + p^a`` that enter the axis row of ``v⁻ ×* f``, and this row.
 
-The base adds ``Rᵀn``, an LDLᵀ of a symmetric 6×6 and two solves with it.  The count ignores symmetric values, equal
-entries and constants that can be combined.  So a program can need fewer operations for some robots.
+For the base, add ``Rᵀn``, an LDLᵀ of a symmetric 6×6 matrix and two solves with it.  The count ignores symmetric
+values, equal entries and constants that can be combined.  So a program can need fewer operations for some robots.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ class _Joint:
 
     @property
     def row(self) -> int:
-        """Index of the entry of a spatial vector that belongs to the joint axis."""
+        """Index of the entry of a spatial vector that acts along or about the joint axis."""
         return self.axis + (3 if self.revolute else 0)
 
     def vector(self, count: _Count, v: Pattern, inward: bool) -> Pattern:

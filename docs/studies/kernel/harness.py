@@ -64,7 +64,7 @@ class Samples:
     def drawn(self) -> tuple[Vector, Vector]:
         """Configurations, shape (COUNT, nq), and world unit normals, shape (COUNT, 3); the same on every run."""
         rng, robot = np.random.default_rng(0), self.robot
-        # The base has random positions and orientations; the joints are within 1 of the default posture.
+        # The base has random positions and orientations; each joint is at most 1 rad (m) from the default posture.
         width = np.full(robot.nv, 1.0)
         width[: robot.first_joint] = np.pi / 2
         start = robot.posture()

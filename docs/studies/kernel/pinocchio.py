@@ -19,8 +19,8 @@ DEFINITIONS = (
     "BOOST_MPL_LIMIT_LIST_SIZE=30", "BOOST_MPL_LIMIT_VECTOR_SIZE=30", "BOOST_MPL_CFG_NO_PREPROCESSED_HEADERS",
     "BOOST_FUSION_INVOKE_MAX_ARITY=12", "FUSION_MAX_VECTOR_SIZE=12", "NDEBUG",
 )  # fmt: skip
-# With the default limits of GCC, the inlining of a formulation depends on the other formulations.  This changes the
-# time of a formulation by up to a fifth.
+# With the default limits of GCC, the inlining of a formulation depends on the other formulations.  This dependence
+# changes the time of a formulation by up to a fifth.
 _INLINE = ("inline-unit-growth=400", "large-function-growth=2000", "large-stack-frame-growth=10000")
 _PARAMETERS = [*[f"--param={p}" for p in _INLINE], *[f"-D{d}" for d in DEFINITIONS]]
 _FLAGS = ("-std=c++17", "-O3", "-march=native", CONTRACT, *_PARAMETERS)
@@ -70,7 +70,7 @@ def model_arrays(model: pin.Model) -> list[np.ndarray]:
     links = range(1, model.njoints)
     kinds, axes = zip(*[_kind(model.joints[i]) for i in links], strict=True)
     if _FREE_FLYER in kinds[1:] or (kinds[0] == _FREE_FLYER and np.any(model.armature[:6])):
-        raise Absent("does a free-flyer at the root alone, without armature")
+        raise Absent("supports only a free-flyer at the root, without armature")
     placed = [model.jointPlacements[i] for i in links]
     bodies = [model.inertias[i] for i in links]
     return [

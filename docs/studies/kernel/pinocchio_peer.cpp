@@ -245,8 +245,8 @@ void factor_hand(Peer & p)
   }
 }
 
-// A step over the joint models of Pinocchio.  With placing: forward kinematics of one joint, its inertia and column
-// in world axes.  Without: the factorization that aba() has computed.
+// Visitor of the joint models of Pinocchio.  With placing: forward kinematics of one joint, its inertia and column in
+// world axes.  Without: the factorization that aba() has computed.
 template<bool placing>
 struct Visit : pin::fusion::JointUnaryVisitorBase<Visit<placing>>
 {

@@ -20,8 +20,8 @@ from impact_posture.robot.robot_loader import load_robot
 
 ROBOTS = ("solo8", "tilthex_arm", "panda", "talos")
 PEERS = {"same graph": same_graph, "pinocchio": kernels, "adam": adam, "casadi": dense}
-# Text of a comparison → beginning of a name, and a name that is left out.  Our fastest row is compared with the
-# fastest row whose name has this beginning, except for the row that is left out.
+# Text of a comparison → prefix of the names of the compared rows, and the name of a row that is left out.  Our
+# fastest row is compared with the fastest of these rows.
 _AGAINST = {
     "Pinocchio's own derivative algorithms": (DERIVATIVES, ""),
     "the fastest by hand on Pinocchio's types": ("Pinocchio", DERIVATIVES),

@@ -20,7 +20,7 @@ from impact_posture.simulation.seed_variation import stand
 from impact_posture.simulation.setup import Setup, set_up
 from impact_posture.simulation.world.world import build_world
 
-# Number of contacts at a point.  To save time, it is smaller than in the scenario files.
+# Number of contacts at a point.  To save time, this number is smaller than in the scenario files.
 COUNT = 2
 # Time at the surface and pause between contacts, s, also shorter than in the scenario files.
 DWELL, PAUSE = 0.4, 0.6
@@ -40,7 +40,6 @@ class Draw:
         scenario: Name of the scenario.
         number: Index of the point: first the variations are counted, then the random draws.
         attempt: Number of earlier random draws for this point that were not admissible.
-        seed: Seed of the study.
         name: Name of the variation; empty for a random draw.
         values: Changed values, by the names of :data:`RANGES`.  All other values are the values of the shipped
             scenario.

@@ -83,9 +83,9 @@ def choice(name: str, own: Sequence[Record]) -> str:
     if name.startswith("aerial"):
         words += f", with {best.force[0]:.1f} times the peak force"
     others = ", ".join(
-        f"`{s.controller}` at {s.kept} (motion {percent(s.motion[1])})" for s in summaries if s is not best
+        f"`{s.controller}` {s.kept} (motion {percent(s.motion[1])})" for s in summaries if s is not best
     )
-    return f"{words}. Of the other controllers, every target is kept by {others}."
+    return f"{words}. Points at which other controllers keep every target: {others}."
 
 
 def _tuned(name: str, own: Sequence[Record]) -> str:
@@ -133,7 +133,7 @@ def _overview(name: str, own: Sequence[Record], controller: str) -> list[str]:
 
 
 def _explained() -> Iterator[str]:
-    yield "Change of the motion in the window / over the second, compared with nominal at the same point. **Bold**:"
+    yield "Change of the motion in the window / over one second, relative to nominal at the same point. **Bold**:"
     yield "all targets are met. *Nominal*: motion of the nominal controller in the window."
 
 

@@ -37,7 +37,7 @@ COMPARED = (NOMINAL, "robust", "robust-flow", "posture", "stiff")
 SATURATED = 0.05
 # Largest number of random draws for a point.
 ATTEMPTS = 40
-# Entries of the document of a run that a record does not store.
+# Keys of the document of a run that are not stored in a record.
 _LEFT_OUT = ("windows", "versions", "runs")
 # Maximum number of offline postures in the cache of this process.
 _KEPT = 16
@@ -50,7 +50,7 @@ class Record:
     """Results of all controllers at one point of the envelope.
 
     Attributes:
-        draw: Values of the point.
+        draw: Point of the envelope, with its changed values.
         rejected: Reason why each earlier draw was rejected, or why this variation cannot be simulated.
         q: Start posture, shape (nq,); empty for a variation that cannot be simulated.
         documents: Documents of the runs, by label of the controller.  The entry ``offset`` is the distance of the

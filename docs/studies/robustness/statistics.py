@@ -13,8 +13,8 @@ from scipy.stats import spearmanr
 from docs.studies.robustness.outcomes import NOMINAL, Record
 from impact_posture.experiment.seed_statistics import value_of
 
-# Predictors of a jump, and functions that read their values from the prediction in a document.  The impulse of a
-# contact is not known before the contact, so the predictor H is √H without the impulse.
+# Name of a predictor of the jump → function that reads its value from the prediction in a document.  The impulse of
+# a contact is not known before the contact, so the predictor H is √H without the impulse.
 PREDICTORS: dict[str, Callable[[Mapping[str, float | None]], float | None]] = {
     "H": lambda p: None if p["H"] is None else math.sqrt(p["H"]),
     "V": lambda p: p["frictionless"],
@@ -156,7 +156,7 @@ def ranks_of_jumps(records: Sequence[Record], names: Sequence[str]) -> dict[str,
 
 
 def fall(record: Record, controller: str, name: str) -> float | None:
-    """Return the decrease of a predictor (logarithm of the ratio) or of the offset (m), relative to nominal."""
+    """Return how much smaller a predictor (logarithm of the ratio) or the offset (m) is than its value for nominal."""
     if name == "offset":
         before, after = (record.documents[c]["offset"] for c in (NOMINAL, controller))
         return None if before is None or after is None else float(before - after)

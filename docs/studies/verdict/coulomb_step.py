@@ -13,8 +13,8 @@ import numpy as np
 
 from docs.studies.core import Vector
 
-# Tangential creep of a contact that sticks, as a share of its mobility.  It makes the forces unique if the corners of
-# a sole constrain more directions than the sole has degrees of freedom.
+# Compliance of a sticking contact along its tangents (creep), as a share of the mobility of the contact.  The creep
+# makes the forces unique if the corners of a sole constrain more directions than the sole has degrees of freedom.
 _CREEP = 1e-4
 # Relative error of a solved step.
 _TOLERANCE = 1e-9
@@ -26,7 +26,7 @@ class CoulombStep:
     """The conditions of one time step.
 
     Attributes:
-        R: Mobility with the compliance of the springs, and creep, shape (3m, 3m).
+        R: Mobility, plus the compliance of the springs and of the creep, shape (3m, 3m).
         w: Velocities of the contact points for ``p = 0``, less ``d``, shape (3m,).
         friction: Friction coefficients, shape (m,).
     """
@@ -40,7 +40,7 @@ class CoulombStep:
         diagonal[0::3] += _CREEP * across
         diagonal[1::3] += _CREEP * across
         diagonal[2::3] += s
-        # Scales from velocities to impulses.
+        # Step sizes of the iteration: impulse per velocity.
         self.rho = np.empty_like(c)
         self.rho[0::3] = self.rho[1::3] = 1 / np.maximum(across, 1e-12 * diagonal[2::3])
         self.rho[2::3] = 1 / diagonal[2::3]

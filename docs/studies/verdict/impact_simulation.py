@@ -6,8 +6,8 @@ Motor torques and thrusts stay constant.  Posture and velocities follow ``M(q) �
 simulation ends at the greatest compression: surface and point then have the same normal velocity.  The robot was at
 rest, so its velocity is the velocity jump of a plastic impact.
 
-The ground only pushes the feet, by springs that are much stiffer and damped, with exact friction.  At rest, equal
-springs under all points of the feet carry the weight.
+The ground only pushes the feet, with exact friction, by damped springs that are much stiffer than the surface.  At
+rest, equal springs under all points of the feet carry the weight.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class Surface:
 
 @dataclass(frozen=True, eq=False)
 class SimulatedImpact:
-    """The impact until the greatest compression.
+    """Result of a simulated impact, up to the greatest compression.
 
     Attributes:
         jump: Velocity jump Δν, shape (nv,).
@@ -103,7 +103,7 @@ class ImpactSimulation:
         held: Whether the feet cannot move, as if they were glued to the ground.
         still: Whether mass matrix and Jacobians stay as in the first posture.
         carried: Vertical forces that carry the weight at rest, N, shape (feet,).
-        stands: Whether these forces balance the weight.
+        stands: Whether the forces ``carried`` balance the weight.
     """
 
     def __init__(
@@ -147,7 +147,8 @@ class ImpactSimulation:
         power = surface.power
         deepest = (surface.speed**2 * (power + 1) / 2 / (surface.stiffness * (J[2] @ X[:, 2]))) ** (1 / (power + 1))
         dt = min(_LONGEST, np.pi / 2 * float(deepest) / surface.speed / _STEPS)
-        # The ground pushes by the depth at the end of the step and by damping, the surface by the mean depth.
+        # The ground force depends on the depth at the end of the step and on damping; the surface force depends on
+        # the mean depth.
         s = 1 / ((1 + _DAMPED) * dt**2 * k)
         for step in range(_PATIENCE * _STEPS):
             if step and not self.still:
@@ -222,7 +223,8 @@ def _respond(M: Vector, feet: Vector | None, tau: Vector) -> Vector:
 def _carried(upward: Vector, weight: Vector) -> tuple[Vector, bool]:
     """Return the forces of equal springs under a rigid robot, and whether they balance its weight.
 
-    The forces of equal springs have the least sum of squares.  Springs push, so a point may carry nothing.
+    The forces of equal springs have the least sum of squares.  Springs only push, so the force at a point can be
+    zero.
     """
     if not len(weight):
         return np.zeros(upward.shape[1]), True

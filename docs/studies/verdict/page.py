@@ -34,10 +34,10 @@ NUMBERS = {
     "force": ("peak force", 0.10),
 }
 VELOCITIES = ("linear", "angular", "joint")
-# A change below this value has no sign.
+# A smaller change counts as no change.
 NO_CHANGE = 0.03
 # Largest relative error of the predicted shortest contact time with which the feet stay.  The simulation determines
-# this time with an accuracy of 5 %.
+# this contact time with an accuracy of 5 %.
 HOLDING = 0.20
 # Reasons why a number may be beyond its bar.
 NEGLIGIBLE, MOVES_LONG = "negligible", "robot moves"
@@ -138,7 +138,7 @@ def _counts(rows: Sequence[Row], request: Request) -> Iterator[str]:
         yield from _feet(rows, request)
     unsolved = sum(pair.unsolved for pair in pairs)
     if unsolved:
-        yield f"{unsolved} time steps of these simulations were not solved."
+        yield f"Unsolved time steps of these simulations: {unsolved}."
 
 
 def _feet(rows: Sequence[Row], request: Request) -> Iterator[str]:
@@ -147,7 +147,7 @@ def _feet(rows: Sequence[Row], request: Request) -> Iterator[str]:
     wrong = [entry for entry in pairs if entry[2].wrong_feet()]
     share, near = f"{100 * MOVES:g} %", len(pairs) - equal - len(wrong)
     yield f"A foot moves if its speed is above {share} of the approach speed. Feet move as predicted in {equal} of"
-    yield f"{len(pairs)} impacts. In {near} others, feet differ by less than {share} of the approach speed."
+    yield f"{len(pairs)} impacts, and within {share} of the approach speed in {near} more."
     for row, name, pair in wrong:
         predicted, simulated = (", ".join(sorted(side.moving)) or "none" for side in (pair.predicted, pair.simulated))
         where = f"{row.case.name}, friction {row.friction:g}, {row.stiffness:.0e} N/m, {name}"
@@ -176,7 +176,7 @@ def _holding(times: Sequence[HoldingTime], request: Request) -> Iterator[str]:
 
 
 def _holding_reason(time: HoldingTime) -> str | None:
-    """Return why a time may be beyond its bar, as :func:`_reason`."""
+    """Return why the error of a time exceeds its bar, as :func:`_reason` does for a number."""
     error, still = (abs(time.predicted / other - 1) for other in (time.simulated, time.still))
     if error <= HOLDING:
         return None

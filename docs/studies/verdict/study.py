@@ -28,7 +28,7 @@ FRICTIONS = (0.0, 0.3, 1.0)
 STIFFNESSES = (1e5, 1e6)
 # In a simulation, a foot or a contact point moves if its speed is above this share of the approach speed.
 MOVES = 0.01
-# The prediction names the right joint if the simulated share of no other joint is larger by more than this fraction.
+# If the simulated share of another joint is larger by more than this fraction, the prediction names the wrong joint.
 _SAME_JOINT = 0.05
 # Accuracy of the simulated shortest contact time with which the feet stay.
 _HOLDING = 0.05
@@ -90,8 +90,8 @@ class Numbers:
         impulse: Normal impulse, N·s.
         force: Largest normal force, N.
         slips: Whether the contact point slides.
-        feet: Frame of each foot → speed of the foot, m/s.  In a prediction, it is the speed at the end; in a
-            simulation, the largest speed during the contact.
+        feet: Frame of each foot → speed of the foot, m/s.  A prediction contains the speed at the end of the impact;
+            a simulation contains the largest speed during the contact.
         moving: Frames of the feet that lift or slide.
     """
 
@@ -171,7 +171,7 @@ class HoldingTime:
     """The shortest contact time, s, with which the feet stay in one posture: predicted, and simulated to 5 %.
 
     Attributes:
-        still: The simulated time with the mass matrix and the Jacobians of the first posture.
+        still: Shortest contact time simulated with the mass matrix and the Jacobians of the first posture.
         long: Whether the verdict would say that the robot moves during a contact of the predicted time.
     """
 

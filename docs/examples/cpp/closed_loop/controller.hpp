@@ -1,4 +1,4 @@
-// An export of `impact-posture codegen ROBOT --controller ... --prefix controller` behind one small class.
+// Wraps an export of `impact-posture codegen ROBOT --controller ... --prefix controller` in one small class.
 #ifndef CLOSED_LOOP_CONTROLLER_HPP
 #define CLOSED_LOOP_CONTROLLER_HPP
 
