@@ -21,8 +21,8 @@ if sys.dont_write_bytecode and not sys.pycache_prefix:
 for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(name, "1")
 
-# A background job of a shell ignores SIGINT, and a program under nohup ignores SIGHUP.  The programs that tests start
-# would inherit this, but not a handler that does nothing.
+# A background job of a shell ignores SIGINT, and a program under nohup ignores SIGHUP.  The programs that tests
+# start would inherit an ignored signal, but they do not inherit a handler that does nothing.
 for number in (signal.SIGINT, signal.SIGHUP):
     if signal.getsignal(number) is signal.SIG_IGN:
         signal.signal(number, lambda *_: None)

@@ -21,8 +21,8 @@ SUFFIXES = {".py", ".c", ".cpp", ".hpp"}
 
 
 def part_of(module: str) -> str:
-    """Return the folder or module of the library to which a dotted name belongs.  The whole command line counts as
-    one part, ``cli``.
+    """Return the folder or module of the library to which a dotted name belongs.  The command line counts as one
+    part.
     """
     names = module.split(".")
     if names[0] == "impact_posture_cli":

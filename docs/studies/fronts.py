@@ -11,8 +11,8 @@ from impact_posture.collision.contact_front import ContactFront, contact_front
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import known_robots, load_robot
 
-# Contact frame → axis of this frame along which the tool points.  A base has no such axis, because a push can come
-# from every side.
+# Contact frame → axis of this frame along which the tool points.  A base can be pushed from every side, so it has no
+# such axis.
 FORWARD = {
     "anymal_kinova": {"j2s6s200_end_effector": "x"},
     "borinot": {"flying_arm_2__ee": "x"},

@@ -94,7 +94,7 @@ def built(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 
 def test_agrees_with_casadi(built: Built) -> None:
     # The C code multiplies by reciprocals, so it rounds differently.  Stiff feet (1/ε of 1e4 robot masses) amplify
-    # this difference.
+    # these rounding differences.
     tolerance = 1e-10 if built.objective.supports else 1e-12
     assert largest_difference(built.library.gradient, built.objective, casadi_reference, 10) <= tolerance
 

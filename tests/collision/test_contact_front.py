@@ -83,7 +83,7 @@ def test_the_front_of_a_round_or_flat_shape_is_exact(kind: str, direction: tuple
     assert np.dot(front.offset, d) == pytest.approx(front.reach, abs=1e-9)
     assert front.link == "hand"
     local = TURN.T @ (np.array(front.offset) - center)
-    # In every direction, the shape reaches at least as far as the point, up to the tolerance of a flat front.
+    # The point is not outside the shape, apart from the tolerance of a flat front.
     for other in np.random.default_rng(0).normal(size=(50, 3)):
         other /= np.linalg.norm(other)
         assert local @ other <= support(kind, other) + 6e-4

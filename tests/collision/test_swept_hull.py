@@ -64,7 +64,7 @@ def test_distance_equals_the_quadratic_program(seed: int, count_a: int, count_b:
 
 
 def test_penetration_is_the_shortest_way_out() -> None:
-    """Two boxes of width 1 m overlap by 0.1 m along x.  Sweep radii of 1 cm increase the penetration to 0.12 m."""
+    """Two boxes of width 1 m overlap by 0.1 m along x.  Sweep radii of 1 cm make the penetration 0.12 m."""
     box = obstacle_hull(Obstacle(name="box", box=(1.0, 1.0, 1.0)))
     swept = hull(box.vertices, 0.01)
     result = separation(swept, pin.SE3(np.eye(3), np.array([0.9, 0.1, 0.2])), swept, pin.SE3.Identity())

@@ -86,7 +86,7 @@ def run_page(page: Path, folder: Path) -> Iterator[Ran]:
     for file in dict.fromkeys(example_files(page)):
         shutil.copy(file, folder / file.name)
     for sweep in folder.glob("press.toml"):
-        # A coarse grid runs the same commands.
+        # A coarse grid is enough to run the commands of the page.
         sweep.write_text(re.sub("count = [57]", "count = 3", sweep.read_text(encoding="utf-8")), encoding="utf-8")
     for shown in shown_commands(page):
         done = run(*shown.arguments, cwd=folder, env={"COLUMNS": "300"})

@@ -188,7 +188,7 @@ def uncommented(text: str) -> str:
 
 @pytest.mark.parametrize("turning", [False, True])
 def test_propellers_are_drafted_as_a_commented_table(turning: bool, tmp_path: Path) -> None:
-    """The frames of the example give the positions, directions and spins of the robot.toml written by hand."""
+    """From the frames, the draft gets the same positions, directions and spins as the handwritten robot.toml."""
     urdf = (QUAD_ARM / "quad_arm.urdf").read_text()
     if turning:
         urdf = re.sub(r'(name="rotor_\d_joint" type=)"fixed"', r'\1"continuous"', urdf)

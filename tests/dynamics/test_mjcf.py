@@ -111,9 +111,9 @@ def test_indices_equal_the_compiled_model(name: str) -> None:
 def without_base_armature(model: pin.Model) -> pin.Model:
     """Remove the armature of base and ball joints that MuJoCo and Pinocchio interpret differently.
 
-    With such armature the mass matrices still agree (below), but the accelerations differ.  In Pinocchio and MuJoCo,
-    the momentum of an armature is fixed in different axes: body axes or world axes.  MuJoCo accepts only one armature
-    value per ball joint.
+    With this armature, the mass matrices agree (tested below), but the accelerations differ.  In Pinocchio and
+    MuJoCo, the momentum of an armature is fixed in different axes: body axes or world axes.  MuJoCo accepts only one
+    armature value per ball joint.
     """
     armature = np.array(model.armature)
     for joint in list(model.joints)[1:]:

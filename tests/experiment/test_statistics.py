@@ -69,7 +69,7 @@ def test_interval_follows_students_t() -> None:
 
 
 def test_reductions_are_paired_by_seed() -> None:
-    # Each value is half of the nominal value of its seed, in another order; seed 9 has no nominal run.
+    # The value of each seed is half of the nominal value of this seed; seed 9 has no nominal run.
     documents = [document("robust", k, (2.0 + 0.1 * k) / 2) for k in (3, 1, 0, 2)] + [document("robust", 9, 50.0)]
     row = row_of("aerial-vertical", "robust", documents, NOMINAL)
     assert row.reduction is not None

@@ -29,7 +29,7 @@ COMMANDS = (
     ("sweep", "sweep.toml", "--workers", "1", "--out", "s"),
     ("sweep", "show", "s"),
 )
-# Seconds of a year, and times of files, s.
+# Seconds of a year, and modification times of files, s.
 YEAR = 365 * 86_400
 FILES = (0, -YEAR, 2**31 + 1, 2**33, 140 * YEAR)
 # Clocks.  The first clock runs backwards, by one second per second.
@@ -56,7 +56,7 @@ def test_wrong_clocks(clock: str, arena: Path, hostile_full: bool) -> None:
     environment = os.environ | {"LD_PRELOAD": FAKETIME, "FAKETIME": clock, "FAKETIME_DONT_FAKE_MONOTONIC": "1"}
     with judging() as judge:
         # With a clock that runs backwards, the simplex method of HiGHS 1.13 in the wheels of CasADi writes outside
-        # its memory, so no sweep runs.  The interior-point method does not, but takes 1.5 times as long.
+        # its memory, so no sweep runs.  The interior-point method is correct, but takes 1.5 times as long.
         for argv in COMMANDS[:-2] if clock == CLOCKS[0] else COMMANDS:
             done = subprocess.run(
                 [COMMAND, *argv, "--quiet"], cwd=arena, capture_output=True, text=True, env=environment, timeout=300

@@ -16,10 +16,10 @@ from tests.hostile.arena import SMALL, judging, strike
 from tests.hostile.test_command_lines import SOUND
 from tests.hostile.test_robot_files import ARM
 
-# Longest time for a command, s: several times the time of a pipe that only the C++ libraries notice.
+# Longest permitted time of a command, s.  A pipe that only the C++ libraries notice takes several times less.
 PATIENCE = 15
 PUSH = ("--frame", "tip", "--normal", "1", "0", "0")
-# Endings of names by which commands choose the format of a file.
+# File name extensions that select the format in which a command reads a file.
 ENDINGS = ("toml", "json", "yaml", "urdf", "xml", "xacro", "srdf")
 
 

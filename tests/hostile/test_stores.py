@@ -1,4 +1,5 @@
-"""A finished run whose stored files were changed runs again or gives an error, even if the checksums match.
+"""If the stored files of a finished run were changed, the run runs again or gives an error, even if the checksums
+match.
 
 ``--hostile-full`` tries many more changes.
 """

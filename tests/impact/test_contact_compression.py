@@ -367,7 +367,7 @@ def test_x_is_unknown_if_the_impact_moves_joints_on_unknown_springs(tmp_path: Pa
     squeezed = evaluation.compression
     assert squeezed is not None and squeezed.x is None and squeezed.fitting is None
     assert "arm_right_4_joint" in squeezed.unknown_springs and "leg_left_2_joint" not in squeezed.unknown_springs
-    # Every named joint moves more than a tenth of the fastest one, with the links alone.
+    # If only the links move, every joint in ``unknown_springs`` moves more than a tenth of the fastest joint.
     links = WorstCaseObjective(with_joint_model(loaded, "link"), objective.contact, supports=loaded.spec.supports)
     jump = np.abs(links.oracle.quantities(loaded.posture()).jump[6:])
     sizes = dict(zip(loaded.tangent_names[6:], jump, strict=True))
@@ -376,7 +376,7 @@ def test_x_is_unknown_if_the_impact_moves_joints_on_unknown_springs(tmp_path: Pa
     for name in ("link", "reflected"):
         value = replace(objective, robot=with_joint_model(loaded, name)).value(loaded.posture())  # type: ignore[arg-type]
         assert f"{value:.4g} with '{name}'" in warning
-    # The comment in the C header says the same.
+    # The comment in the C header names the same joints.
     (tmp_path / "c").mkdir()
     export(objective, tmp_path / "c", compression=squeezed, check=False)
     (header,) = (path for path in (tmp_path / "c").glob("*.h") if "arm_right_4_joint" in path.read_text())

@@ -99,7 +99,7 @@ def test_impulses_equal_impulse_dynamics(name: str, normal: tuple[float, float, 
 
 
 def test_the_set_matters_where_the_rank_drops() -> None:
-    """The impulses with the smallest pull at the ground include internal forces between the planar legs of solo8."""
+    """The support impulses that pull the ground least include internal forces between the planar legs of solo8."""
     loaded, supports = standing("solo8")
     q = loaded.posture()
     oracle = oracle_of("solo8", (0.0, 1.0, -0.6))
@@ -151,7 +151,7 @@ def test_kept_feet_as_expression_and_in_numbers_agree(name: str, frame: str) -> 
 
 
 def test_kept_feet_change_the_optimum() -> None:
-    """Without `keep_contacts`, the optimum pulls at the ground.  With it, the given friction suffices."""
+    """Without `keep_contacts`, the optimum pulls at the ground.  With it, the given friction keeps the feet."""
     values = {"robot": "solo12", "frame": "base_link", "normal": (0.0, 0.0, -1.0)}
     free = prepare(make_settings(dict(values)))
     kept = prepare(make_settings({**values, "keep_contacts": True, "friction": 1.0}))

@@ -99,7 +99,7 @@ def test_gradients_of_mass_and_jumps_equal_differences(name: str, friction: floa
     expressed, gradient = (np.array(v).ravel() for v in mass.gradient_fun()(q, objective.contact.normal))
     assert relative(expressed, value[:1]) < 1e-9 and relative(gradient, mass.gradient(q)) < 1e-8
     # In the literature, the effective mass is the inverse of the mobility along the normal.  Friction never reduces
-    # the mass.
+    # the effective mass.
     G = objective.oracle.quantities(q).G
     assert value[0] * G == pytest.approx(1) if friction == 0 else value[0] * G > 1
 

@@ -140,9 +140,9 @@ def test_oracle_by_its_definition(name: str) -> None:
 
 @pytest.mark.parametrize("name", SOME)
 def test_lifted_form(name: str) -> None:
-    """The initial guess satisfies the equations, gives the oracle's value, and is the only solution near it."""
+    """The initial guess is an isolated solution of the equations of the lifted form, and gives the oracle's value."""
     for k, (loaded, contact, metric, supports) in enumerate(combinations(name)):
-        # Robots in WHOLE are tested with every combination and objective kind, other robots with fewer kinds.
+        # Robots in WHOLE are tested with every objective kind for each combination, other robots with one kind.
         for kind in KINDS if name in WHOLE else [KINDS[(NAMES.index(name) + k) % len(KINDS)]]:
             objective = WorstCaseObjective(loaded, contact, metric, kind, supports)
             q, n = ca.SX.sym("q", loaded.nq), ca.SX.sym("n", 3)

@@ -127,7 +127,7 @@ def test_every_box(floating: bool, count: int, feet: int, metric: str, axes: str
     assert_close(worst.impulses @ jumps.T @ W @ jumps @ worst.impulses, value, 1e-9, "attained there")
     assert_close(worst.jump, jumps @ worst.impulses, 1e-8, "its jump")
 
-    # With bilateral impulses, opposite corners have equal values, so compare with the third largest value.
+    # With bilateral impulses, opposite corners have equal values, so the next smaller value is the third.
     best = np.sort(values)[::-1]
     if best[2 if bilateral else 1] < value * (1 - 1e-3):
         gradient = objective.gradient(q)
@@ -201,7 +201,7 @@ def test_a_simultaneous_impact_along_conflicting_normals_is_refused() -> None:
 
 
 def test_a_simultaneous_impact_of_points_on_one_link_is_not_exported() -> None:
-    """Their distance is constant, so their mobility is singular at all postures, but the objective exists."""
+    """The distance of the points is constant, so their mobility is always singular, but the objective exists."""
     loaded = robot("panda")
     first, second = (ImpactContact(frame, (0, 0, 1)) for frame in ("panda_hand_tcp", "panda_hand"))
     objective = WorstCaseObjective(loaded, first, Metric(), "sticking", others=(second,))
@@ -212,7 +212,7 @@ def test_a_simultaneous_impact_of_points_on_one_link_is_not_exported() -> None:
 
 @pytest.mark.parametrize("feet", [(), ("HL_FOOT", "HR_FOOT")])
 def test_an_optimum_of_a_simultaneous_impact_certifies(feet: tuple[str, ...]) -> None:
-    """The other feet are supports, or contacts too."""
+    """The other feet are either supports, or contacts like the struck feet."""
     struck = tuple(f"{foot}:0,0,1" for foot in ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT") if foot not in feet)
     task = {
         "robot": "solo12", "normal": None, "contact": struck, "support": feet, "contact_pose": "position",
@@ -256,7 +256,7 @@ def test_corners() -> None:
         assert one_sided.shape == (2**count - 1, count) and both.shape == (2 ** (count - 1), count)
         assert len({tuple(c) for c in one_sided}) == len(one_sided) and one_sided.any(axis=1).all()
         assert len({tuple(c) for c in (*both, *-both)}) == 2**count
-        assert one_sided[0].all(), "all at once comes first: what a user expects of equally bad ones"
+        assert one_sided[0].all(), "among equally bad corners, the corner with all impulses comes first"
 
 
 def test_an_evaluation_has_each_contact_alone_and_the_worst_impulses() -> None:
@@ -322,7 +322,7 @@ def test_no_feasible_posture_is_better() -> None:
 
 
 def test_an_optimum_at_a_kink_certifies_by_a_mixture() -> None:
-    """If two corners tie, neither gradient vanishes on the constraints, but a convex combination vanishes."""
+    """At two equally bad corners, neither gradient vanishes on the constraints, but a convex combination does."""
     problem = problem_of(TASKS["two feet"], bilateral=True)
     solution = solve(problem, starts=6, jobs=1, compile="never")
     points = problem.objective.subgradients(solution.q)
@@ -335,7 +335,7 @@ def test_an_optimum_at_a_kink_certifies_by_a_mixture() -> None:
 
 
 def test_optima_far_below_their_start_certify() -> None:
-    """If the objective decreases ten-thousandfold, corners tie only up to the accuracy of the solver."""
+    """If the objective falls ten-thousandfold, equally bad corners agree only to the accuracy of the solver."""
     task = {"robot": "icub", "contact_pose": "free", "com": False, "contact": (
         "r_gripper_joint:-0.033,-0.472,-0.830:0.92", "l_gripper_joint:-0.983,-1.982,0.553:2.89",
         "root_joint:0.586,-0.165,1.748:2.53", "l_leg_ft_sensor:0.826,2.150,0.821:2.87")}  # fmt: skip

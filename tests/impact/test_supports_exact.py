@@ -134,7 +134,7 @@ def test_the_oracle_solves_what_it_is_given(
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize(("name", "label"), CASES)
 def test_the_oracles_sticking_impact(name: str, label: str, seed: int | None) -> None:
-    """S and ∇S are as accurate as after a rounding of the matrices: no condition number enters squared."""
+    """S and ∇S are as accurate as for rounded matrices: no error grows with the square of a condition number."""
     x = bounded(name, label, 1e-4)
     with elsewhere(seed):
         oracle = objective(name, 1e-4).oracle

@@ -126,7 +126,7 @@ def test_the_time_above_which_the_weight_holds_the_feet() -> None:
     assert before is not None and after is not None
     assert before.lifts or before.slides
     assert not (after.lifts or after.slides)
-    # Twice the speed needs twice the weight.
+    # If the speed doubles, the feet stay only if their weight acts for twice the time.
     assert longest_lifting_time(feet, [objective.oracle], 2.0) == pytest.approx(2 * time, rel=0.1)
 
 

@@ -404,7 +404,7 @@ def test_jump_bars_carry_the_jump(tilthex: ResultView, panda: ResultView) -> Non
     figure = jump_figure(tilthex)
     panels = np.array(figure.axes).reshape(3, 2)
     for column, factor in ((0, [1.0, 1.0]), (1, [0.6 / tilthex.before.G, 0.6 / tilthex.after.G])):
-        # In each panel, a patch holds the bars of the initial posture, and another the bars of the optimum.
+        # In each panel, one patch has the bars of the initial posture, another patch the bars of the optimum.
         data = [[patch.get_data() for patch in axes.patches] for axes in panels[:, column]]
         for state, bars, gain in zip((tilthex.before, tilthex.after), zip(*data, strict=True), factor, strict=True):
             np.testing.assert_allclose(np.hstack([b.values[::2] for b in bars]), gain * state.jump, rtol=1e-12)

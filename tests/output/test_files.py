@@ -39,7 +39,7 @@ def test_figures_are_written_in_all_formats(tilthex: ResultView, tmp_path: Path)
         if path.suffix == ".png":
             image = matplotlib.image.imread(path)
             assert image.shape[1] == round(200 * WIDTH)
-            # The drawing covers the left and right, the top and bottom half of the page.
+            # The drawing reaches the left, right, top and bottom part of the page.
             rows, columns = (image[..., :3].min(axis=2) < 0.9).nonzero()
             assert rows.min() < 0.1 * len(image) < 0.8 * len(image) < rows.max()
             assert columns.min() < 0.1 * image.shape[1] < 0.8 * image.shape[1] < columns.max()

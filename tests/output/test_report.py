@@ -385,7 +385,7 @@ def test_a_browser_draws_it_offline(folder: Path, scene: ReportScene, tmp_path: 
     with browser(tmp_path / "profile") as tab:
         tab.open(folder / "report.html")
         before = tab.picture("#view")
-        # If the surface or the robot is hidden, the picture changes, so both are visible.
+        # Hiding the surface or the robot changes the picture, so both were visible.
         hide(tab, "surface")
         without_surface = tab.picture("#view")
         assert different(before, without_surface) > 0.05

@@ -89,7 +89,7 @@ def test_two_carts_strike_together_with_the_least_share_of_the_limits(tmp_path: 
     best = linprog(np.eye(4)[-1], sides, np.zeros(6), np.column_stack([both, np.zeros(2)]), [1.5, 1.5],
                    [(None, None)] * 3 + [(0, None)])  # fmt: skip
     assert best.fun == pytest.approx(0.5) and best.fun - 1e-7 <= strike.share <= 1.01 * best.fun
-    # A plastic impact of both carts stops the two sliders, so the torso keeps its momentum without resistance.
+    # A plastic impact of both carts stops the two sliders.  Nothing resists the torso, so it keeps its momentum.
     np.testing.assert_allclose(both @ strike.follow_through.velocity, 0.0, atol=1e-9)
 
 
@@ -189,7 +189,7 @@ def test_a_robot_that_falls_lands_only_on_level_ground() -> None:
 
 
 def test_a_robot_whose_contacts_turn_with_its_links_does_not_fall() -> None:
-    """In the given posture, the ground is level, but at another posture the normal of the foot is another one."""
+    """The ground is level in the given posture, but the normal turns with the foot."""
     task = {"robot": "solo12", "frame": "FL_FOOT", "contact_pose": "position", "support": ()}
     level = prepare(make_settings({**task, "normal": (0, 0, 1)})).problem
     up = Numeric(level.robot.model).at(level.given).placement(point_on(level.robot, "FL_FOOT")).rotation[2]

@@ -183,8 +183,8 @@ def test_without_the_extra_the_command_stops_before_it_solves(tmp_path: Path) ->
 def crank(folder: Path) -> Path:
     """Write a planar linkage with its tip at (0.5, 0), whose crank can turn fully (0.1 + 0.5 < 0.4 + 0.4).
 
-    The elbow angles at the start and at the optimum have opposite signs.  No motion that holds the tip leads from one
-    to the other.
+    The elbow angles at the start and at the optimum have opposite signs.  No motion that holds the tip leads from
+    the start to the optimum.
     """
     limit, ends = '<limit lower="-3.1" upper="3.1" effort="5" velocity="9"/>', (0.0, 0.1, 0.4, 0.4)
     parts = [link("link_0"), link("tip"), joint("tool", "link_3 tip", None, f"{ends[3]} 0 0", "fixed", "")]

@@ -57,7 +57,7 @@ def solved(name: str) -> PostureSolution:
 
 @pytest.fixture(params=CASES, scope="module")
 def moments(request: pytest.FixtureRequest) -> tuple[Robot, PosturePath, list[tuple[float, Array, Array, Array]]]:
-    """A timed path, and its motion at ten places from row to row."""
+    """A timed path, and its motion at ten instants between rows."""
     solution = solved(request.param)
     path = posture_path(solution, strike=STRIKES.get(request.param))
     assert (path.strike is None) == (request.param not in STRIKES)
@@ -106,7 +106,7 @@ def test_limits_hold_at_the_rows_and_between_them(
     if not base:
         # A timed path is as fast as possible if it reaches a limit at all times.
         assert max(largest, fastest) > 0.98
-        # The files also contain the shares between the rows.
+        # The largest use in the files also includes instants between the rows.
         assert path.use is not None and path.use.largest["torque"] == pytest.approx(largest, abs=2e-3)
 
 
@@ -115,7 +115,7 @@ def test_limits_hold_at_the_rows_and_between_them(
 def test_limits_hold_for_the_trajectory_as_a_robot_interpolates_it(
     name: str, normal: tuple[float, ...], tmp_path: Path
 ) -> None:
-    """The file names quintic polynomials. SciPy builds them, and RNEA by Pinocchio gives their torques."""
+    """SciPy builds the quintic polynomials that the file names, and RNEA by Pinocchio gives their torques."""
     task = {"robot": name, "normal": normal, "contact_pose": "position"}
     solution = solve(prepare(make_settings(task)).problem, starts=4, jobs=1)
     loaded, path = solution.problem.robot, posture_path(solution)

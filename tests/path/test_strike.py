@@ -117,7 +117,7 @@ def test_the_run_up_is_straight_and_clear_and_keeps_feet_and_base(name: str) -> 
         if problem.surroundings is not None:
             assert not problem.surroundings.collisions(q)
     assert heights[0] == pytest.approx(strike.run_up_m, rel=1e-3) and (np.diff(heights) < 0).all()
-    # The robot leaves the beginning of the run-up from rest, and the contact never enters the surface before.
+    # The robot begins the run-up at rest, and the contact point is not in the surface at any earlier posture.
     assert np.abs(path.at(strike.run_up_s)[1]).max() < 1e-9
     assert min(n @ (contact_of(problem, q)[0].translation - home.translation) for q in path.q) > -1e-6
 
@@ -262,7 +262,7 @@ def test_constraints_on_the_impact_do_not_hold_on_the_way() -> None:
 
 
 def test_the_surface_stays_in_the_world_while_the_contact_backs_off() -> None:
-    """The surface of the problem follows the contact point, so it is nearer to the other links by the run-up."""
+    """The surface of the problem follows the contact point.  So it is nearer to the other links before the run-up."""
     (solution, path), numeric = struck("ur5"), Numeric(robot("ur5").model)
     spaces, strike = StrikeSpaces(solution.problem, path.q[-1]), path.strike
     assert strike is not None

@@ -1,4 +1,4 @@
-"""The adaptive search: functions of a batch, descents, screening, and the sentence about what was not seen."""
+"""The adaptive search: functions of a batch, descents, screening, and the sentence about unseen optima."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def descended(manifold: ConstraintManifold, x: np.ndarray) -> Ends:
 )
 def test_a_batch_equals_single_calls(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     manifold = ConstraintManifold(CASES[name].problem())
-    # Two full runs of the operations, and a third with one posture.
+    # Two full batches, and a third batch with one posture.
     x = drawn(manifold, 2 * batch_function._WIDTH + 1, 0)
     for loop in (batch_function._compiled_loop(), None):
         monkeypatch.setattr(batch_function, "_compiled_loop", lambda loop=loop: loop)

@@ -163,7 +163,7 @@ def test_a_pair_that_stays_violated_has_rows_for_all_corners_in_the_end() -> Non
 
 
 def test_a_pair_that_slack_lets_off_gets_no_more_corners() -> None:
-    """If slack permits a penetration, more rows do not help; without slack, the program still lacks rows."""
+    """If a slack permits the penetration, more rows do not help.  Without slack, the program still lacks rows."""
     robot, rng = load_robot("tilthex_arm"), np.random.default_rng(5)
     constraint = Clearance("c", [_separator(robot, kind) for kind in KINDS], "words")
     numeric, seen = Numeric(robot.model), 0

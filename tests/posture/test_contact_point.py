@@ -81,7 +81,7 @@ def test_front_and_offset_together_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_conflict_names_the_front_if_the_front_has_no_conflict(tmp_path: Path) -> None:
-    """While the wrist stays in place, the elbow is in the ground.  While the tip stays in place, it can rise."""
+    """While the wrist stays in place, the elbow is in the ground.  With a fixed tip, the elbow can rise."""
     parts, angles = ['<link name="base"/>'], {"shoulder": 0.585, "elbow": -1.17, "wrist": 1.1}
     above = "base"
     for joint, at, length, high in (("shoulder", 0.0, 0.3, 1.6), ("elbow", 0.3, 0.3, -0.1), ("wrist", 0.3, 0.2, 2.5)):

@@ -109,6 +109,6 @@ def test_estimates_are_right_in_the_mean(optima: int, seed: int) -> None:
         estimates.append(unseen_share(hits[hits > 0]))
         truths.append(shares[hits == 0].sum())
         numbers.append(estimated_optima(hits[hits > 0]))
-    # Good–Turing errs by less than 1/16 on average for any shares; Chao's bound is valid on average.
+    # For any probabilities of the optima, Good–Turing errs by less than 1/16 on average.  Chao's bound is valid.
     assert abs(np.mean(estimates) - np.mean(truths)) < 1 / 16 + 0.02
     assert np.mean(numbers) < optima * 1.3 + 1

@@ -134,7 +134,7 @@ def test_mujoco_stands_still_under_the_torques_and_forces(name: str) -> None:
 
 
 def least_share(posed: ConstrainedProblem, q: Vector) -> float:
-    """Return the least share by a program on faces of friction pyramids and thrusts (N); NaN if unbalanced."""
+    """Return the least share of the limits, by a linear program over corner forces and thrusts; NaN if unbalanced."""
     model, spec = posed.robot.model, posed.robot.spec
     blocks, cones = [], []
     for support in posed.objective.supports:

@@ -190,7 +190,7 @@ def test_the_largest_of_separate_objectives(name: str, feet: bool, kind: str) ->
 
 
 def test_subgradients_where_two_payloads_are_as_bad() -> None:
-    """A payload may hang on either side.  Bisection determines the mass at which both sides are equally bad."""
+    """A payload hangs on one of two sides.  Bisection determines the mass at which both sides are equally bad."""
     nominal_robot = robot("solo12")
     q = random_configurations(nominal_robot.model, 1, "either side", spread=0.3)[0]
     contact = ImpactContact("base_link", (0.0, 0.3, 1.0))
@@ -261,7 +261,7 @@ def test_how_far_the_optimum_moves() -> None:
     assert [s.at_robust for s in robustness.model_variants] == at_robust and robustness.worst_robust == max(at_robust)
     for one, member in zip(robustness.model_variants, members, strict=True):
         assert one.own_q is not None and one.own_optimum == member.value(one.own_q)
-        assert one.own_optimum <= one.at_robust * (1 + 1e-7), "its own optimum is best for it"
+        assert one.own_optimum <= one.at_robust * (1 + 1e-7), "its own optimum is the best for this variant"
         assert one.moved == pytest.approx(np.linalg.norm(pin.difference(problem.robot.model, q, one.own_q)), rel=1e-9)
     first = robustness.model_variants[0]
     assert first.own_optimum is not None and first.own_q is not None
@@ -327,8 +327,7 @@ def test_balance_and_feet_hold_in_every_model_variant() -> None:
         lambda x: centers[1].evaluate(Numeric(problem.robot.model).at(x))[0], problem.robot.model, solution.q, 1e-4
     )
     assert_close(jacobian, expected, 1e-7, "Jacobian of the loaded center of mass")
-    # With the payload, the robot would tip over in the optimum of the unloaded problem, so the constraint is
-    # necessary.
+    # Without the constraint, the robot would tip over with the payload in the optimum of the unloaded problem.
     plain = prepare(make_settings(task)).problem
     alone = solve(plain, starts=2, jobs=1, compile="never")
     assert centers[1].evaluate(Numeric(plain.robot.model).at(alone.q))[0].max() > -centers[1].margin

@@ -65,7 +65,7 @@ def scan(problem: ConstrainedProblem, rods: list[float], count: int) -> Vector:
     values = []
     for first in np.stack(np.meshgrid(*[grid] * (len(rods) - 2)), axis=-1).reshape(-1, len(rods) - 2):
         angles = np.cumsum(first)
-        # At zero angle, a rod hangs straight down.  After a rotation about y, its direction is (−sin, −cos).
+        # At zero angle, a rod hangs straight down.  Rotated about y, it points along (−sin, −cos).
         elbow = -np.array([np.sin(angles), np.cos(angles)]) @ rods[: len(first)]
         gap = target - elbow
         length = np.hypot(*gap)

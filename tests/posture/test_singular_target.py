@@ -48,7 +48,7 @@ def test_a_stretched_arm_is_named_and_gets_a_bent_start(tmp_path: Path) -> None:
 
 
 def test_only_singular_targets_are_named(tmp_path: Path) -> None:
-    """A target is singular only if all postures are singular.  Another start does not change a stated target."""
+    """A target is singular only if all postures are singular.  An initial posture does not change a stated target."""
     problem = candle(tmp_path)
     bent = np.array([0.0, 0.5, 0.0, -0.5, 0.0, 0.5, 0.0])
     assert singular_target(problem, [problem.given, bent]) is None

@@ -167,8 +167,8 @@ def test_no_posture_of_a_null_space_of_one_dimension_is_better(case: str) -> Non
     for point in curve.points:
         best = values[away <= point.within].min()
         assert point.objective <= best * (1 + 1e-9)
-        # The objective is also not too low.  The walk may exceed the distance by 0.01, and its minimum by half of
-        # this value.
+        # The objective is also not too low.  The walk may exceed the distance by 0.01, and the minimum of the walk
+        # may exceed it by half of this value.
         assert point.objective >= values[away <= point.within + 0.011].min() - 1e-5 * values.max()
 
 

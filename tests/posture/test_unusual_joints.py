@@ -96,7 +96,7 @@ def gripper(folder: Path, gap: float, **settings: Any) -> ConstrainedProblem:
 
 @pytest.mark.parametrize(("gap", "noted"), [(-0.0004, True), (0.0, True), (0.002, False)])
 def test_held_fingers_may_touch(tmp_path: Path, gap: float, noted: bool) -> None:
-    """Nothing can open held fingers, so their pair is a note, also for shapes that overlap."""
+    """Nothing can open held fingers, so a note names their pair, even if their shapes overlap."""
     problem = gripper(tmp_path, gap, hold=("left_joint", "right_joint"))
     assert any("held joints fix them: left / right" in note for note in problem.notes) == noted
     assert "self-collision" not in [c.name for c in problem.constraints]

@@ -103,7 +103,7 @@ def test_small_changes_are_about_the_same() -> None:
     assert outcome_of(felt) == "better" and "peak force 100 to 103 N (about the same)" in felt[-1].line
     dearer = changes(before, replace(after, peak_force=110.0), 1.0, 0.1)
     assert outcome_of(dearer) == "better for the joints at the price of force"
-    # A base that hardly moves does not decide, even if its jump doubles.
+    # A base that hardly moves does not affect the outcome, even if its jump doubles.
     still = replace(before, base_linear=1e-4), replace(after, base_linear=1e-3)
     assert outcome_of(changes(*still, 1.0, 0.03)) == "better"
     assert outcome_of(changes(before, before, 1.0, 0.0)) == "no better"

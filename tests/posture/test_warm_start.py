@@ -1,4 +1,4 @@
-"""Runs of the solver that start from the end of a run with another target."""
+"""Warm starts: the solver starts from the result of a problem with another target."""
 
 from __future__ import annotations
 

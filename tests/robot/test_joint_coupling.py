@@ -277,7 +277,7 @@ def test_the_simulated_world_moves_coupled_joints_together(tmp_path: Path) -> No
 
 
 def test_joint_equalities_of_an_mjcf_are_couplings(tmp_path: Path) -> None:
-    """``data`` of the constraint relates changes from the reference positions."""
+    """The attribute ``data`` of an equality couples changes of the joints from their reference positions."""
     pytest.importorskip("mujoco")
     equality = '<equality><joint joint1="wrist" joint2="shoulder" polycoef=".1 -2 {} 0 0"/></equality></mujoco>'
     twice = '<joint joint1="wrist" joint2="elbow"/>'

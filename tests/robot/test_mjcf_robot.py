@@ -179,7 +179,7 @@ def test_excluded_and_neighboring_bodies_may_touch(tmp_path: Path) -> None:
     pairs = disabled_links(loaded(tmp_path, ARM))
     assert {frozenset(("base", "fore")), frozenset(("upper", "fore"))} <= pairs
     assert frozenset(("base", "hand")) not in pairs and frozenset(("upper", "hand")) not in pairs
-    # The thigh follows the trunk through two joints in one body.
+    # Two joints in one body connect the thigh with the trunk.
     assert frozenset(("trunk", "thigh_fl")) in disabled_links(loaded(tmp_path, QUADRUPED))
 
 

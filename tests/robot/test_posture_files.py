@@ -58,7 +58,7 @@ def test_posture_json_names_the_entries_of_q_and_gives_one_angle_per_joint(tmp_p
     assert content["q_names"] == ["a cos", "a sin", "b (rad)", "c cos", "c sin"]
     assert content["joints"] == pytest.approx({"a": 2.0, "b": -0.5, "c": -3.0}, abs=1e-15)
     assert np.allclose(read_posture(loaded, save(tmp_path / "both.json", content)), q, rtol=0, atol=1e-15)
-    # A user may edit the angles, but not one of two contradicting values.
+    # A user may edit the angle in ``joints``, but then ``q`` must not contain another value of this angle.
     content["joints"] = {**content["joints"], "a": 1.0}  # type: ignore[dict-item]
     with pytest.raises(PostureError, match=r"a cos is -0.416147 in q, but 0.540302 under its name; remove either q"):
         read_posture(loaded, save(tmp_path / "edited.json", content))

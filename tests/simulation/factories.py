@@ -21,7 +21,7 @@ from impact_posture.simulation.setup import Setup, set_up
 AERIAL = ("aerial-vertical", "aerial-lateral")
 PUSHES = ("solo8-push", "talos-push")
 SHIPPED = (*AERIAL, *PUSHES)
-# A contact with a table, from a posture that ``more`` may give.
+# Scenario of a contact with a table; ``more`` may state the start posture.
 HIT = """
 name = "mine"
 robot = "{robot}"

@@ -275,7 +275,7 @@ def test_the_correction_removes_velocities_of_impulses_only(name: str) -> None:
 def test_the_invariant_part_of_a_velocity_is_kept(name: str) -> None:
     factory, driver = shared_factory(name), invariant(name)
     reading = moving(factory, name, "kept")
-    # Impulses do not change the null space of J M⁻¹.
+    # Impulses do not change the components of the velocity in the null space of J M⁻¹.
     kept = np.linalg.svd(impulses(name, reading.q).T)[2][3:]
     correction = driver._correction(reading)
     np.testing.assert_allclose(kept @ (reading.v + correction), kept @ reading.v, atol=1e-9)

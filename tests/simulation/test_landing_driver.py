@@ -104,7 +104,7 @@ def test_after_the_contact_the_body_follows_the_planned_stop(monkeypatch: pytest
     assert after.impacts == after.stopped == 1
 
     def away(run: Run, since: float, until: float) -> float:
-        """Return the largest distance of the base from its height in the plan, m, in a time after the touch."""
+        """Return the largest error of the height of the base, m, in an interval after the touch."""
         (touch,), (t, q) = run.of("impact"), (run.series.t, run.series.q)
         ticks = run.series.slice(touch.begin + since, touch.begin + until)
         return max(abs(z - rows.at(at - touch.begin)[0][2]) for at, z in zip(t[ticks], q[ticks, 2], strict=True))

@@ -33,8 +33,7 @@ def test_robust_against_nominal(
     name: str, settle: float, changes: dict[str, Any], nominal: Band, reduction: Band, lowered: Band
 ) -> None:
     metrics, before = [], []
-    # With the time `settle` before the impact, the motion q and H of the robust controller are within 8 % of the
-    # values for 6 s.
+    # The motion and H of the robust controller are within 8 % of their values for a `settle` time of 6 s.
     for controller, seconds in (("nominal", 0.5), ("robust", settle)):
         factory = controller_factory(shortened(name, settle=seconds, **changes))
         record = driven(factory, controller)

@@ -209,7 +209,7 @@ def test_a_damaged_build_is_repeated(builds: list[Path]) -> None:
 def test_a_gradient_that_cannot_be_compiled_is_interpreted(
     fault: str, builds: list[Path], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """The user gets one warning, and the numbers are the same."""
+    """The user gets one warning, and the numbers equal the numbers of the compiled gradient."""
     setup = shared_factory("aerial-vertical").setup
     if fault == "no compiler":
         monkeypatch.setenv("PATH", str(tmp_path))

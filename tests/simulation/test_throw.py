@@ -25,7 +25,7 @@ from tests.simulation.factories import controller_factory
 from tests.support.helpers import Vector
 from tests.support.pinocchio_values import frame_jacobian, mass_matrix
 
-# Scenario of the throw, flight direction of the ball, and sign.
+# Scenario of a throw, flight direction of the ball, and sign of the throw.
 THROWS = [("solo8-throw", (-1, 0, 0), 1), ("solo8-throw", (0.3, -0.4, -1.0), -1), ("talos-throw", (0.5, 1.0, 0.0), 1)]
 
 

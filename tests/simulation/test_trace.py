@@ -59,7 +59,7 @@ def test_a_trace_has_the_state_of_every_tick(name: str, monkeypatch: pytest.Monk
             if k:
                 assert trace.peak[k, j] == shape.peak
                 assert np.isnan(trace.began[k, j]) if shape.began is None else trace.began[k, j] == shape.began
-    # The first mark of a trace includes the force peaks and touches of all earlier ticks.
+    # The first mark of a trace includes the force peaks and touches of all ticks before this mark.
     for j in range(len(truths[0].shapes)):
         assert trace.peak[0, j] == max(truth.shapes[j].peak for truth in truths[:17])
         began = [t.shapes[j].began for t in truths[:17] if t.shapes[j].began is not None]

@@ -172,7 +172,7 @@ def test_the_jumps_as_recorded_contain_trend_and_controller(groups: dict[Group, 
     np.testing.assert_allclose(share, PERIOD * sum(range(CONTACT, CONTACT + 7)), rtol=1e-9)
     np.testing.assert_allclose(plain.measured.relative, other.relative)
     recorded = Fit([hit], recorded=True).measured.jump
-    trend = hit.trend()[1] * PERIOD * 7  # from the last interval before the contact to the middle of the mean
+    trend = hit.trend()[1] * PERIOD * 7  # from the last interval before the contact to the middle of AVERAGED
     assert_close(recorded - plain.measured.relative, trend, 0.01, "trend")
 
 

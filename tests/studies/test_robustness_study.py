@@ -142,7 +142,7 @@ def test_both_aerial_scenarios_use_one_robot() -> None:
 
 
 def test_a_failure_is_an_outcome(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first draw is invalid.  In the second draw, one controller diverges and another has no optimum."""
+    """The first start is invalid.  In the second draw, one controller diverges and another has no optimum."""
     monkeypatch.setattr(outcomes, "prepare", short)
     tried: list[str] = []
     ran: list[tuple[tuple[Run, ...], dict[str, Any]]] = []
@@ -164,7 +164,7 @@ def test_a_failure_is_an_outcome(monkeypatch: pytest.MonkeyPatch) -> None:
     assert record.draw == draw(AERIAL, number, attempt=1)
     assert {c for c in COMPARED if record.failure(c)} == {"robust", "posture"}
     assert all(record.missed(c) == {"completed": "no completed run"} for c in ("robust", "posture"))
-    # The controller `stiff` received the run of `nominal`.
+    # The record contains the run of `nominal` also as the run of `stiff`.
     assert record.documents["stiff"]["metrics"] == record.documents[NOMINAL]["metrics"]
     assert record.documents[NOMINAL]["metrics"]["contacts"] == 1
     assert record.documents[NOMINAL]["offset"] is not None

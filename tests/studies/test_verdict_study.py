@@ -17,7 +17,7 @@ from impact_posture.impact.impact_contact import point_on
 from impact_posture.robot.posture_files import read_posture
 from tests.support.helpers import robot
 
-MASS, HALF, HEIGHT = 2.0, 0.2, 0.3  # of a box: kg, half of its edge along x and y, half of its height, m
+MASS, HALF, HEIGHT = 2.0, 0.2, 0.3  # mass of a box, kg; half of its edge along x and y, m; half of its height, m
 INERTIA = np.array([0.07, 0.09, 0.05])
 AHEAD, SPEED, STIFF = np.array([1.0, 0.0, 0.0]), 0.8, 2e5
 CORNERS = [np.array([x, y, -HEIGHT]) for x in (-HALF, HALF) for y in (-HALF, HALF)]
@@ -78,7 +78,7 @@ def test_a_free_box_slides_or_sticks(friction: float) -> None:
 
 
 def test_sliding_turns_the_direction_of_friction() -> None:
-    """Hit outside of its planes of symmetry, the slip and the friction stay opposite to each other."""
+    """If the box is hit outside of its planes of symmetry, the slip and the friction stay opposite to each other."""
     result = hit_box(np.array([-HALF, 0.11, 0.17]), 0.2)
     slip = (mobility(np.array([-HALF, 0.11, 0.17])) @ result.impulse)[1:]
     assert np.linalg.norm(slip) == pytest.approx(result.slip, rel=1e-3)
@@ -89,7 +89,7 @@ def test_a_standing_box_tips_about_an_edge() -> None:
     """The box turns about the edge as soon as the moment of the force exceeds the moment of the weight."""
     height, gravity, speed = 0.5, 9.81, 0.05
     mass = (INERTIA[1] + MASS * (HALF**2 + HEIGHT**2)) / height**2
-    # Above the edge, the point moves only along the normal.
+    # The point is above the edge, so it moves only along the normal.
     result = hit_box(np.array([HALF, 0.0, height - HEIGHT]), 2.0, gravity=gravity, feet=True, speed=speed)
     least = MASS * gravity * HALF / height
     assert result.force == pytest.approx(least + speed * np.sqrt(STIFF * mass), rel=5e-3)

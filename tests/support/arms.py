@@ -28,7 +28,6 @@ def arm(
 
     Args:
         axes: Axis of each hinge in the frame of the preceding body.
-        joints: Angles of the default posture.
         floating: If true, the arm is mounted below the hexarotor of ``tilthex_arm``; else its base is fixed.
         rods: Vector from each hinge to the next, and from the last hinge to the tip, m; by default 0.3 m down.
         effort: Torque limit of the motors, N·m; zero if the motors have no limit.

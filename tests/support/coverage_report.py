@@ -21,7 +21,7 @@ LEAST = 90.0
 REASONS = {
     "cli/commands/reproduce.py": "the page for people: tests ask for JSON",
     "impact_posture/posture/program/posture_nlp.py": "what Ctrl-C does while IPOPT runs in the main process",
-    "impact_posture/posture/search/multistart.py": "second guesses and failures that no test problem meets",
+    "impact_posture/posture/search/multistart.py": "second attempts and failures that no test problem has",
 }
 
 

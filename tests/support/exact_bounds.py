@@ -10,8 +10,8 @@ to sixty digits:
   to the feet, so it cannot guarantee a smaller error.
 
 An error bound is the size of the matrix change ``ΔK`` or ``ΔM̃`` times the condition number of the quantity.  If a
-quantity needs several solves, the sum of their bounds would be far too large.  For such a quantity, the bound is the
-change of the exact value when its input doubles are rounded once more.
+quantity needs several solves, the sum of their bounds would be far too large.  For a quantity that needs several
+solves, the bound is the change of the exact value when all input numbers are rounded once.
 """
 
 from __future__ import annotations

@@ -42,7 +42,6 @@ def exported(
     """Return the folder of a robot's controller with default gains and a library.
 
     Args:
-        name: Name of the robot.
         objective: Objective whose gradient the posture task follows.
         flags: Flags for the compiler.
         path: Posture that the reference flow visits first; empty for a controller without a flow.

@@ -96,7 +96,7 @@ class Relaxation:
         return Answer(code, z, report.iterations, report.violation, shortest)
 
 
-# Smallest violation that is significant, relative to the length of a row times the size of the point.
+# Smallest violation that counts, relative to the norm of a row of A times the norm of z.
 COUNTS = 1e-7
 
 

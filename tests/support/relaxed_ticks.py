@@ -30,7 +30,7 @@ RUNS = {
 
 @dataclass(frozen=True, eq=False)
 class RelaxedTick:
-    """Program of a tick, with the Python solution.
+    """Program of a tick that must be relaxed, with the solution of the Python controller.
 
     Attributes:
         H: Cost matrix, shape (n, n).

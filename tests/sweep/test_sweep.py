@@ -350,7 +350,7 @@ def test_a_folder_of_another_sweep_is_refused(aerial: Path, tmp_path: Path, monk
 
 
 def test_speeds_with_the_same_problem_have_the_same_result(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The better optimum is at the last point.  Along y, only points with the first speed are adjacent."""
+    """The better optimum is at the last point.  Along y, only points with the first speed are neighbors."""
     values = {(0, 0): 9.0, (0, 1): 9.0, (1, 0): 9.0, (1, 1): 1.0}
     template = SimpleNamespace(problem=object())
     solver: Any = SimpleNamespace(

@@ -121,7 +121,7 @@ def add(out: Path, text: str, *, force: bool = False) -> None:
 
 
 def state(folder: Path) -> dict[str, tuple[int, int]]:
-    """Return inode and time of each file.  Both stay the same only if a file is neither replaced nor written."""
+    """Return inode and time of each file.  Replacing or writing a file changes at least one."""
     paths = (path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())
     return {str(path): (path.lstat().st_ino, path.lstat().st_mtime_ns) for path in paths}
 

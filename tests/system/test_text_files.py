@@ -14,7 +14,7 @@ import impact_posture
 from impact_posture.system.text_files import MOST_BYTES, MOST_CHARACTERS, open_regular, read_bytes, read_text
 
 ROOT = Path(impact_posture.__file__).parent
-# Modules that may call these methods, because the files do not come from users, and what the modules do.
+# Modules that may open files without ``open_regular``, because users do not provide these files, and what they read.
 ALLOWED = {
     "text_files.py": "opens regular files",
     "isolated_calls.py": "reads files of the kernel",
@@ -39,7 +39,7 @@ def readers(path: Path) -> Iterator[str]:
         if not isinstance(node, ast.Call):
             continue
         name = ast.unparse(node.func)
-        # The functions of text_files have no dot in their names.
+        # Calls of functions of text_files have no dot in their names, so they are not counted.
         of_module = name in ("np.load", "ET.parse", "json.load", "tomllib.load", "yaml.load", "pickle.load")
         method = name.rpartition(".")[2] in ("open", "read_text", "read_bytes") and "." in name
         if name == "open" or method or of_module:
@@ -79,7 +79,7 @@ def test_regular_files_and_the_null_device_are_read(tmp_path: Path) -> None:
 
 
 def test_huge_files_are_refused(tmp_path: Path) -> None:
-    """The files have holes, so that they need no space on the disk."""
+    """The files are sparse, so they need no space on the disk."""
     for read, size in ((read_text, MOST_CHARACTERS), (read_bytes, MOST_BYTES)):
         (tmp_path / "file").touch()
         os.truncate(tmp_path / "file", size + 1)

@@ -206,7 +206,7 @@ def test_joints_stop_at_their_limits(margin: float) -> None:
 
 
 def test_acceleration_bounds_never_cross() -> None:
-    """The states are within the limits and far outside, slow and too fast."""
+    """The states are within the limits or far outside, and slow or too fast."""
     for name in ("tilthex_arm", "talos", "panda"):
         r = robot(name)
         for law in (LimitLaw(), LimitLaw(acceleration=30.0, margin=0.1)):

@@ -396,7 +396,7 @@ def test_the_return_to_tasks_keeps_speed_and_acceleration() -> None:
     flow.on, before = True, flow.velocity.copy()
     for _ in range(round(3.0 / DT)):
         flow.advance(DT, flow.q)
-        # The velocity and acceleration limits of the flow have the same size.
+        # The flow and its correction have the same limits, so their sum can exceed these limits.
         assert np.abs(flow.velocity).max() < 1.5 * flow.options.speed
         assert np.abs(flow.velocity - before).max() < 2.1 * flow.options.acceleration * DT
         before = flow.velocity.copy()

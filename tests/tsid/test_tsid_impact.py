@@ -130,7 +130,7 @@ def test_online_meets_offline(exported: dict[str, ImpactGradient], objective: st
         assert command.status is Status.SOLVED
         v = v + dt * command.acceleration
         q = np.array(pin.integrate(r.model, q, dt * v))
-        # A robot rests if it is slow for a hundred ticks; for a shorter time, the motion may only reverse.
+        # The motion may reverse, so the robot counts as at rest only after a hundred slow ticks.
         slow = slow + 1 if np.abs(v).max() < 2e-4 else 0
         if slow > 100:
             break

@@ -63,8 +63,8 @@ def test_feet_stay_where_they_are(name: str) -> None:
 def dense_torques(controller: Controller, q: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Return the torques of the same tick over (ν̇, f, τ), from raw Pinocchio calls.
 
-    Each sole is modeled by forces at its four corners.  The cost applies to the total wrench of the corner forces, so
-    that the optimum is the same. The solver is qpOASES of CasADi, as in the paper.
+    Each sole is modeled by forces at its four corners.  The cost contains the total wrench of the corner forces, so
+    the optimum equals the optimum of the controller. The solver is qpOASES of CasADi, as in the paper.
     """
     r, formulation = controller.robot, controller.formulation
     model, nv, nj = r.model, r.nv, r.nv - 6

@@ -133,7 +133,7 @@ def test_another_armature_fails_in_its_source(monkeypatch: pytest.MonkeyPatch) -
 
 
 def altered(how: Any) -> Any:
-    """Return a source with Pinocchio's numbers, modified by ``how(number of the sample, values)``."""
+    """Return a source of values: the values of Pinocchio, modified by ``how(number of the sample, values)``."""
 
     def build(objective: WorstCaseObjective) -> Any:
         count = iter(range(100))

@@ -134,8 +134,6 @@ def elastic_response(arm: Arm, box: float, q: Vector) -> ElasticResponse:
 
 
 def with_duration(arm: Arm, box: float, q: Vector) -> Arm:
-    """Return the arm with the contact stiffness for which a box of mass ``box`` compresses for
-    :data:`COMPRESSION`.
-    """
+    """Return the arm with the contact stiffness for which a box of this mass compresses for :data:`COMPRESSION`."""
     mass = 1 / ImpactOracle(arm.case(box)).quantities(with_box(q)).G
     return replace(arm, stiffness=ContactStiffness(duration=COMPRESSION).linear_stiffness(mass, 1.0))

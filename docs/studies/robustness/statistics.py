@@ -156,7 +156,7 @@ def ranks_of_jumps(records: Sequence[Record], names: Sequence[str]) -> dict[str,
 
 
 def fall(record: Record, controller: str, name: str) -> float | None:
-    """Return how much smaller a predictor (logarithm of the ratio) or the offset (m) is than its value for nominal."""
+    """Return how much smaller a predictor (logarithm of the ratio) or the offset (m) is than for nominal."""
     if name == "offset":
         before, after = (record.documents[c]["offset"] for c in (NOMINAL, controller))
         return None if before is None or after is None else float(before - after)

@@ -147,8 +147,8 @@ class ImpactSimulation:
         power = surface.power
         deepest = (surface.speed**2 * (power + 1) / 2 / (surface.stiffness * (J[2] @ X[:, 2]))) ** (1 / (power + 1))
         dt = min(_LONGEST, np.pi / 2 * float(deepest) / surface.speed / _STEPS)
-        # The ground force depends on the depth at the end of the step and on damping; the surface force depends on
-        # the mean depth.
+        # The ground force follows the depth at the end of the step and damping; the surface force follows the mean
+        # depth.
         s = 1 / ((1 + _DAMPED) * dt**2 * k)
         for step in range(_PATIENCE * _STEPS):
             if step and not self.still:
