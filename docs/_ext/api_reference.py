@@ -43,5 +43,4 @@ def markdown(names: list[str]) -> str:
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
-    """Register the directive."""
     return add_directive(app, "api-reference", markdown)

@@ -135,5 +135,4 @@ def markdown() -> str:
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
-    """Register the directive."""
     return add_directive(app, "cli-reference", lambda _: markdown())

@@ -92,6 +92,5 @@ def module_map() -> str:
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
-    """Register the directive."""
     add_directive(app, "module-map", lambda _: module_map())
     return add_directive(app, "package-structure", lambda _: markdown())

@@ -64,8 +64,6 @@ class PointTask(mink.Task):
 
 @dataclass(frozen=True)
 class Outcome:
-    """Results of a run."""
-
     q: np.ndarray
     mass: np.ndarray  # effective mass at the start and after each tick, kg
     error: float  # largest distance of the tool from its point, m

@@ -38,8 +38,6 @@ def null_space_torque(M: np.ndarray, J: np.ndarray, torque: np.ndarray) -> np.nd
 
 @dataclass(frozen=True)
 class Outcome:
-    """Results of a run."""
-
     q: np.ndarray
     H: np.ndarray  # at each tick
     error: float  # largest distance of the tool from its position at the start, m

@@ -34,8 +34,6 @@ SPEED = 1.0  # norm of the velocity K/K_d ∇H at the first tick, which gives K 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Results of a run."""
-
     q: np.ndarray
     H: np.ndarray  # at each tick
     tip_error: float  # largest distance of the tip from its point, m

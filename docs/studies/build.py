@@ -30,7 +30,6 @@ class Built:
     compile_s: float
 
     def symbol(self, name: str) -> ctypes.c_void_p:
-        """Address of a function."""
         return ctypes.cast(getattr(self.library, name), ctypes.c_void_p)
 
 

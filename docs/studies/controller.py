@@ -123,7 +123,6 @@ def equality(ticks: int) -> Iterator[str]:
 
 
 def growth(_: int) -> Iterator[str]:
-    """Yield a table of the growth of memory during random ticks."""
     head = ["robot", "random ticks", "growth", "statuses: solved, relaxed, infeasible, unsolved, not finite"]
     yield from table(head, controller_equality.growth(RANDOM))
 

@@ -120,12 +120,10 @@ class Request:
 
 
 def page_of(name: str) -> Path:
-    """Return the path of the page of a study."""
     return ROOT / "docs" / "generated" / f"{name}.md"
 
 
 def say(words: str, end: str = "\n") -> None:
-    """Print progress on standard error."""
     print(words, end=end, file=sys.stderr, flush=True)
 
 

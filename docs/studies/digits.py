@@ -29,7 +29,6 @@ _HEAD = "robot|n|rank of $J_s$|ε m|bound|$H$ moved|oracle: H|∇H|f|kernel: H|�
 
 
 def lines(request: Request) -> Iterator[str]:
-    """Yield a row for each case and compliance."""
     yield (
         f"Smallest number of correct digits over the default posture and {request.count} random postures. In\n"
         "brackets: digits that backward error analysis guarantees. $H$ moved: largest relative change of $H$ by\n"

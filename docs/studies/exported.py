@@ -23,7 +23,6 @@ _ROUNDS = 61
 
 
 def feet(request: Request) -> Iterator[str]:
-    """Yield a row for each robot and set of flags."""
     rows = (row for name, target in _FEET.items() if request.only in name for row in _standing(name, target))
     yield from table(["exported H and ∇H", "made by", "standing µs", "free µs", "ratio", "target"], rows)
 

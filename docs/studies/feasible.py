@@ -45,7 +45,6 @@ class Cost(NamedTuple):
 
 
 def lines(request: Request) -> Iterator[str]:
-    """Yield a row for each robot and normal."""
     yield "Each robot of the catalogue hits a floor (*down*) and a wall (*ahead*) with its contact frame. Each"
     yield f"search has {STARTS} starts. *free*: no constraints on collisions and motors. *clear*: no collisions."
     yield "*all*: no collisions, and the motors can hold the posture. *collide*: number of distinct optima of"

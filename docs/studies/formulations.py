@@ -29,7 +29,6 @@ _Runs = list[tuple[float, int, bool]]
 
 
 def lines(request: Request) -> Iterator[str]:
-    """Yield a row for each case and formulation."""
     yield from (machine(), "")
     yield from table(_HEAD, (row for name in _CASES if request.only in name for row in _rows(name, request.count)))
 

@@ -102,7 +102,6 @@ def result(scenario: str, name: str) -> dict[str, Any]:
 
 
 def lines(request: Request) -> Iterator[str]:
-    """Yield a table for each scenario."""
     controllers = [c for c in COMPARED if c in CONTROLLERS]
     # At other speeds, only the nominal controller runs, and the controllers for which the objective matters.
     others = [c for c in controllers if c.endswith(("nominal", "robust", "sticking"))]

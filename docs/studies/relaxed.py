@@ -21,7 +21,6 @@ _HEAD = (
 
 
 def lines(request: Request) -> Iterator[str]:
-    """Yield a row for each robot."""
     yield from (machine("daqp"), "")
     yield (
         "Processor time of a call, the shortest of ten in five passes, `-O2`; "

@@ -84,7 +84,6 @@ def test_inputs_of_paths(name: str, strikes: bool, tmp_path: Path, hostile_full:
 
 
 def write_metric(place: Path, name: str, frame: str, number: str) -> Path:
-    """Export a metric into a new folder, and return the folder."""
     (place / "m").mkdir()
     objective = impact_of(formulation_of(name)[0], frame, (1.0, 0.0, 0.0))
     export(objective, place / "m", prefix="m", real=REALS[number], check=False)

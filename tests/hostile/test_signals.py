@@ -58,7 +58,6 @@ def session(leader: int) -> list[str]:
 
 
 def times(count: int) -> list[tuple[str, int, signal.Signals]]:
-    """Return command, number and signal of each case."""
     return [(name, k, SIGNALS[(k + n) % len(SIGNALS)]) for k in range(count) for n, name in enumerate(COMMANDS)]
 
 

@@ -105,7 +105,6 @@ def test_torques_agree_with_statics_the_expression_and_differences(name: str, se
 
 @pytest.mark.parametrize("name", ["talos", "solo12"])
 def test_mujoco_stands_still_under_the_torques_and_forces(name: str) -> None:
-    """MuJoCo applies the forces at the feet and the torques at the joints; no acceleration results."""
     mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")
     posed, (case,) = problem(name), cases(name)
     rest, model, q = case.equilibrium, posed.robot.model, posed.given

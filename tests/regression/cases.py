@@ -48,7 +48,6 @@ class Case:
         )
 
     def solve(self) -> tuple[Prepared, PostureSolution]:
-        """Solve the problem with the defaults of the command."""
         prepared = prepare(self.settings)
         settings = prepared.settings
         return prepared, solve(prepared.problem, seed=settings.seed, screened=SCREENED)

@@ -82,7 +82,6 @@ def formulation_of(name: str) -> tuple[Robot, TaskFormulation]:
 
 
 def compiled(name: str, objective: WorstCaseObjective | None = None) -> CompiledController:
-    """Return the controller of a robot."""
     return CompiledController.load(exported(name, objective), robot=load_robot(name))
 
 

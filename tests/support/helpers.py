@@ -25,7 +25,6 @@ def robot(name: str) -> Robot:
 
 
 def contact_frame(loaded: Robot) -> str:
-    """Return the default contact frame of a robot."""
     assert loaded.spec.contact.frame is not None
     return loaded.spec.contact.frame
 

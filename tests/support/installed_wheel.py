@@ -204,7 +204,6 @@ def suite(work: Path, programs: Path, arguments: list[str]) -> None:
 
 @contextmanager
 def step(what: str) -> Iterator[None]:
-    """Print the name of a step and its duration."""
     print(f"{what} …", flush=True)
     start = time.monotonic()
     yield

@@ -40,7 +40,6 @@ def frame_jacobian(model: pin.Model, q: Vector, frame: int, offset: ArrayLike = 
 
 
 def frame_placement(model: pin.Model, q: Vector, frame: int) -> pin.SE3:
-    """Return the placement of a frame in the world."""
     data = model.createData()
     pin.framesForwardKinematics(model, data, q)
     return pin.SE3(data.oMf[frame])

@@ -72,7 +72,6 @@ def measure_restitution(
     """Let a ball hit a surface along the normal, without gravity.
 
     Args:
-        law: Contact law of the surface.
         speed: Approach speed, m/s.
         timestep: Time step of the physics, s.
         mass: Mass of the ball, kg.  The result does not depend on the mass, because MuJoCo scales the law.

@@ -55,5 +55,4 @@ def figure(rows: Sequence[Row]) -> Figure:
 
 
 def draw(rows: Sequence[Row]) -> None:
-    """Write the figure into the images of the documentation."""
     figure(rows).savefig(PICTURE, dpi=150)

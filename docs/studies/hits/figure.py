@@ -62,5 +62,4 @@ def figure(groups: Mapping[Group, Sequence[Hit]], best: Evaluation) -> Figure:
 
 
 def draw(groups: Mapping[Group, Sequence[Hit]], best: Evaluation) -> None:
-    """Write the figure into the images of the documentation."""
     figure(groups, best).savefig(PICTURE, dpi=150)

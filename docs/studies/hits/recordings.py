@@ -63,7 +63,6 @@ class Hit:
     """Samples around one contact, one row per 5 ms.
 
     Attributes:
-        name: Name of the file.
         group: Posture and box.
         contact: Index of the first row in which the contact shows, give or take one row.
         q: Joint positions, rad, shape (k, 7).

@@ -37,7 +37,6 @@ class Draw:
     """One point of the envelope of a scenario.
 
     Attributes:
-        scenario: Name of the scenario.
         number: Index of the point: first the variations are counted, then the random draws.
         attempt: Number of earlier random draws for this point that were not admissible.
         name: Name of the variation; empty for a random draw.

@@ -43,7 +43,6 @@ _HEAD = (
 
 
 def page(records: Records) -> Iterator[str]:
-    """Yield the lines of the page as Markdown."""
     yield from ("### What to choose", "")
     yield from (choice(name, own) for name, own in records.items() if tried(own))
     yield from (_tuned(name, own) for name, own in records.items() if sum(bool(r.draw.name) for r in tried(own)) > 1)

@@ -42,7 +42,6 @@ _OVERVIEW = (
 
 
 def page(records: Records, seed: int) -> Iterator[str]:
-    """Yield the page as lines of Markdown."""
     records = {name: own for name, own in records.items() if tried(own)}
     yield from (choice(name, own) for name, own in records.items())
     yield from (*_stiffness(records), *_failed(records), *_predictors(records))
@@ -259,6 +258,5 @@ def _drawn(records: Records, seed: int) -> Iterator[str]:
 
 
 def range_table(scenarios: Sequence[str]) -> Iterator[str]:
-    """Yield a table of the varied values and their ranges."""
     body = [[f"`{name}`", f"`{r.name}`", r.text(), r.words] for name in scenarios for r in RANGES[name]]
     return table(["scenario", "value", "range", "what it is"], body)

@@ -31,7 +31,6 @@ class Summary:
     last.
 
     Attributes:
-        controller: Label of the controller.
         count: Number of points.
         helps: Number of points with less motion in the impact windows than with the nominal controller.
         gentler: Number of points with a lower peak jump than with the nominal controller.

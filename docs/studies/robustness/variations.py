@@ -25,7 +25,6 @@ class Range:
         return float(rng.uniform(self.low, self.high))
 
     def text(self) -> str:
-        """Return the range as text for the page."""
         how = {"linear": "{} … {}", "log": "{} … {}, log-uniform", "sign": "{} or {}"}[self.scale]
         return how.format(f"{self.low:g}", f"{self.high:g}")
 
