@@ -100,7 +100,7 @@ def _explain(error: Exception, arguments: Sequence[str]) -> _Fault:
 
 
 def _place_and_hint(error: OSError) -> tuple[str, str]:
-    """Return the file of an error, and a hint.  Calls that read a deleted current folder name no file."""
+    """Return the file of an error, and a hint.  If the current folder was deleted, the error names no file."""
     where, hint = str(error.filename or ""), "check the path and its permissions"
     if not where:
         hint = f"{DEBUG_VARIABLE}=1 shows where"
@@ -128,7 +128,8 @@ def _usage(error: Any, wants_json: bool) -> int:
 
 def _reword_choice(error: Any) -> None:
     """Replace the message of Typer for an invalid choice by the message for an invalid choice in a file."""
-    # Typer offers no way to set this message.  In all versions, the message contains the value and the choices.
+    # Typer has no setting for the message about an invalid choice.  In all versions, it contains the value and the
+    # choices.
     match = re.search(r"'(.*?)' is not one of ('.*)", str(getattr(error, "message", "")))
     if match:
         from impact_posture.errors import not_one_of

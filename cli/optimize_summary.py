@@ -80,7 +80,7 @@ def summarize(page: Page, prepared: Prepared, solution: PostureSolution, documen
     if "reachable" in document:
         share = percent(1 - answer["objective"] / initial["objective"])
         page.line(f"reduction {share} where the path ends; the next lines are about the optimum")
-    page.line(f"reduction {percent(solution.reduction)}; {free} left by the constraints")
+    page.line(f"reduction {percent(solution.reduction)}; {free} remaining under the constraints")
     if "robustness" in document:
         page.line(document["robustness"]["line"])
     for note in solution.notes[len(prepared.problem.notes) :]:
@@ -96,7 +96,7 @@ def summarize(page: Page, prepared: Prepared, solution: PostureSolution, documen
         _tradeoff(page, document, [n for n in document["notes"] if n.startswith("trade-off:")])
     if "path" in document:
         _path(page, document["path"])
-    # Leave out the first warnings, which were printed before the solver started.
+    # The first warnings are not printed again, because they were printed before the solver started.
     page.warnings(document["warnings"][len(prepared.warnings) :])
 
 
@@ -152,7 +152,7 @@ def _tradeoff(page: Page, document: dict[str, Any], notes: list[str]) -> None:
     points = document["tradeoff"]
     page.gap()
     digits = 3 if document["tradeoff_against"] == "distance" else 1
-    bound = {"distance": "a distance from the initial one (rad, mixed with m)", "force": "a peak force (N)"}
+    bound = {"distance": "a distance from the initial posture (rad, mixed with m)", "force": "a peak force (N)"}
     page.line(f"trade-off: the best posture within {bound[document['tradeoff_against']]}")
     first, last = points[0]["objective"], points[-1]["objective"]
     rows = []

@@ -22,7 +22,7 @@ class PictureFormat(StrEnum):
 
 
 def option(names: str, panel: str, help: str, **more: Any) -> Any:
-    """Return a Typer option.  ``names`` are its spellings, and ``panel`` is its panel in ``--help``."""
+    """Return a Typer option with ``names`` such as ``"--force -f"``, in this ``panel`` of ``--help``."""
     return typer.Option(*names.split(), help=help, rich_help_panel=panel, **more)
 
 

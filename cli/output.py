@@ -29,8 +29,8 @@ def use_options(options: Iterable[str]) -> None:
 def as_options(text: str) -> str:
     """Replace each parameter name in backquotes by its option, for example ```out``` by ``--out``.
 
-    If the subcommand has no such option, the parameter is the key of a file, and the name is printed in quotes.
-    After "optimize again with", the name is an option of ``optimize``.
+    If the subcommand has no such option, the name is printed in quotes, because the parameter is then a key of a
+    file.  A name after "optimize again with" always becomes an option, because ``optimize`` has this option.
     """
 
     def name(match: re.Match[str]) -> str:
@@ -68,7 +68,7 @@ class Page:
     def progress(
         self, doing: str, unit: str = "", *, first: str = ""
     ) -> AbstractContextManager[Callable[[int, int], None] | None]:
-        """Return the context :func:`.progress` of a progress line."""
+        """Return a context that shows a progress line (:func:`.progress`)."""
         return progress(doing, unit, shown=not (self.quiet or self.json), first=first)
 
     def title(self, text: str, detail: str = "") -> None:

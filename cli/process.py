@@ -19,7 +19,7 @@ _LEAST_MEMORY = 1 << 30
 
 
 def prepare() -> None:
-    """Set up streams, environment and signals.  Only the entry point calls this, because it changes the process."""
+    """Set up streams, environment and signals of the process; only the entry point may call this function."""
     _open_streams()
     # Let the program read and remove its own files.  A umask such as 777 would prevent this.
     os.umask(os.umask(0o077) & 0o077)
@@ -27,7 +27,7 @@ def prepare() -> None:
     os.environ["MPLBACKEND"] = "agg"
     # NumPy and Matplotlib fail if the date of a reproducible build is not a number.  No output contains a date.
     os.environ.pop("SOURCE_DATE_EPOCH", None)
-    # Rich makes lines of this width.  A huge width fills the memory, and lines of width zero are empty.
+    # Rich takes the line width from COLUMNS.  A huge width fills the memory, and lines of width zero are empty.
     if not re.fullmatch(r"[1-9]\d{0,3}", os.environ.get("COLUMNS", "80")):
         del os.environ["COLUMNS"]
     # Threads of the linear algebra do not help with small matrices, but they use memory and can fail to start.

@@ -21,9 +21,9 @@ def progress(
     """Show a progress line while the block runs.
 
     The line shows the messages of the library (:func:`impact_posture.system.progress.tell`) and the progress that the
-    block reports.  The block reports by a function with the arguments ``(done, all)``, which it receives.  If no line
-    is shown, the block receives ``None``.  If ``unit`` is empty, the line shows a bar but no numbers.  Before the
-    first report, the line shows ``first`` instead of ``doing``.
+    block reports.  To report, the block calls the yielded function with ``(done, all)``.  If no line is shown,
+    ``None`` is yielded.  If ``unit`` is empty, the line shows a bar but no numbers.  Before the first report, the
+    line shows ``first`` instead of ``doing``.
     """
     from rich.console import Console
 

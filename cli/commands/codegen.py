@@ -124,7 +124,7 @@ def _check_problem(typed: TypedSettings, robot: str) -> None:
 def _objectives(
     typed: TypedSettings, robot: str, from_result: bool
 ) -> tuple[list[WorstCaseObjective], Array | None, Compression | None, tuple[str, ...], str]:
-    """Return objectives, optimum of a result, first known compression, warnings, and why ``auto`` chose its type."""
+    """Return objectives, optimal posture of a result, compression, warnings, and the reason for ``auto``."""
     if from_result:
         from impact_posture.output.result_reader import load_view
 

@@ -72,7 +72,7 @@ def _write(page: Page, robot: str, load: LoadOptions, out: str, *, force: bool) 
     if not page.quiet:
         page.line("Check what was guessed:")
         page.table((), [("  -", line) for line in dict.fromkeys(draft.guesses)])
-        page.line("Then optimize. Options that this file states can be left out:")
+        page.line("Then optimize. You need not repeat options that are in this file:")
         beside = path.name == "robot.toml" and path.parent == Path(robot).parent
         config = "" if beside else f" --config {path}"
         # Do not wrap this line, because users copy it.

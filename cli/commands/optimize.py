@@ -18,7 +18,7 @@ from impact_posture_cli.settings_options import TypedSettings, with_settings
 if TYPE_CHECKING:
     from impact_posture.output.result_folder import Written
 
-# Thresholds of the garbage collector.  They are high, so that the garbage collector rarely runs.
+# Thresholds of the garbage collector, which are so high that the garbage collector rarely runs.
 _RARELY = 200_000, 50, 100
 
 RobotOrProblem = Annotated[
@@ -70,7 +70,7 @@ def optimize(
         check_strike(prepared.problem, prepared.impact.speed)
     folder = Path(out) if out else default_out(prepared)
     check_output(folder, force=force, kind="result")
-    # Raise the error for a name that TOML forbids now, before the search.
+    # Check before the search that TOML allows all names, so that the result can be written afterwards.
     dump_settings(resolved_settings(prepared))
     announce(page, prepared)
     with page.progress("solving", "starts", first="building the expressions") as advance:
@@ -116,7 +116,7 @@ def optimize(
 
 
 def _settings(robot: str, typed: TypedSettings) -> ProblemSettings:
-    from_file = robot.endswith((".toml", ".yaml", ".yml"))  # YAML gets an error that names TOML.
+    from_file = robot.endswith((".toml", ".yaml", ".yml"))  # The reader refuses YAML.
     if not from_file and os.path.isfile(problem := Path(robot) / "problem.toml"):
         from impact_posture.robot.robot_loader import known_robots
 

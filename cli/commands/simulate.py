@@ -106,11 +106,12 @@ def simulate(
     if json:
         print_json(document)
     else:
-        # Leave out the first warnings.  They are about the scenario, and were written before the run.
+        # The first warnings concern the scenario.  They are not printed again, because they were printed before the
+        # run.
         _show(page, document, job.label, folder, document["warnings"][len(factory.setup.warnings) :])
     if document["status"] != "completed":
         sys.stdout.flush()
-        complain(f"error: {experiment.name}, {job.label}: {fate(document)}; its numbers are not a result")
+        complain(f"error: {experiment.name}, {job.label}: {fate(document)}; do not use its numbers")
         raise typer.Exit(SimulationDiverged.exit_code)
 
 
@@ -151,7 +152,7 @@ def _show(page: Page, document: dict[str, Any], label: str, folder: Path, notes:
     ticks = sum(part["ticks"] for part in runs)
     rows += [
         ("relaxed", f"{count['relaxed_ticks']} of {ticks} ticks, in which limits made a task give way"),
-        ("held", f"{count['failed_ticks']} ticks without a new command, in which the last one was kept"),
+        ("held", f"{count['failed_ticks']} ticks without a new command, in which the last command was kept"),
     ]
     if any(window["kind"] == "dwell" for window in document["windows"]):
         rows.append(("contacts", f"{count['contacts']} of {count['contacts_asked']}"))
@@ -188,7 +189,7 @@ def _numbers(metrics: dict[str, Any], prediction: dict[str, Any]) -> list[tuple[
     joints = f"base {number(metrics['q_total_impact_base'])}, joints {number(metrics['q_total_impact_joints'])}"
     rows = [("q_total_impact", f"{number(metrics['q_total_impact'])}  ({joints}; rad, mixed with m)")]
     restitution = [] if prediction["restitution"] is None else [
-        ("restitution", f"{number(prediction['restitution'])} from the contact law; the predicted jump contains it")
+        ("restitution", f"{number(prediction['restitution'])} from the contact law, used in the predicted jump")
     ]  # fmt: skip
     if metrics["q_total_dwell"]:
         rows.append(("q_total_dwell", number(metrics["q_total_dwell"])))

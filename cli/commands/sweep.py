@@ -107,7 +107,7 @@ def sweep(
             f"{100 * run.solver_s / max(run.total_s, 1e-9):.0f} % of it in the solver"
         )
     page.line(f"written to {place}")
-    page.warnings(f"{name} was damaged or of another sweep, and was written again" for name in run.damaged)
+    page.warnings(f"{name} was damaged or belonged to another sweep; it was rewritten" for name in run.damaged)
 
 
 def _executor(

@@ -84,8 +84,8 @@ class Emitter:
     """C code of the blocks of one layout.
 
     The names of blocks begin with ``prefix``.  ``types`` maps a width to its C type.  ``size`` is the size in bytes
-    of the type of width one; by default, the size of ``real``.  ``work`` is the name of the C structure with inputs
-    and work arrays.  ``work`` is empty if the inputs are separate arguments.
+    of the type for a single value (width 1); by default, the size of ``real``.  ``work`` is the name of the C
+    structure with inputs and work arrays.  ``work`` is empty if the inputs are separate arguments.
     """
 
     def __init__(

@@ -20,17 +20,17 @@ from impact_posture.config.cached_values import cached
 from impact_posture.system.libraries import source_key
 
 LARGEST_VECTOR = 64
-"""Size of the widest vectors, bytes.  A batch computes narrower vectors in groups of at most this total size."""
+"""Size of the widest vectors, bytes.  A batch with narrower vectors computes several together, up to this size."""
 
 # Stack bytes for return addresses, saved registers, alignment and the variables of the small functions.  The stack
 # contains the variables of only one block at a time, because the macro APART prevents the inlining of blocks.
 _FRAMES = 2048
-# With -march=native, a compiler can combine neighboring numbers into vectors.  The stack then grows by up to this
-# factor, because several vectors may contain the same number.
+# With -march=native, a compiler can combine neighboring numbers into vectors.  Such code uses up to this factor more
+# stack, because several vectors may contain the same number.
 _SPILL = 2
 
-# Largest number of statements in a block of a batch.  The instructions of such a block stay in the first-level cache
-# while the block computes one group of configurations after the other.
+# Largest number of statements in a block of a batch.  A block of this size fits the first-level cache while it
+# computes one group of configurations after the other.
 _BATCH_BLOCK = 60
 
 # Up to this number of operations, the blocks of a CUDA function are inlined, so that values can stay in registers.

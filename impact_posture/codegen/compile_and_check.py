@@ -64,8 +64,8 @@ def compile_and_check(
     """
     manifest, _ = read_manifest(export_dir / f"{prefix}.json")
     real, worst = REALS[manifest["real"]], 0.0
-    # A killed process cannot delete its temporary files.  They lie in the folder of the export, so that they are
-    # deleted together with the export.
+    # A killed process cannot delete its temporary files.  Temporary files are in the folder of the export, so that
+    # they are deleted together with the export.
     with scratch_folder(export_dir) as folder:
         if keep or (built := _cached_library(export_dir, prefix)) is None:
             built = build_library(export_dir, prefix, library_path(export_dir if keep else folder, prefix))

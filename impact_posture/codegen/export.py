@@ -141,8 +141,8 @@ def export(
         check: Compile the code, and compare its results with CasADi and Pinocchio.
 
     Raises:
-        InputError: The prefix is not a C identifier, the objectives differ in more than the contact, the joint model
-            is ``elastic``, or ``cuda`` is requested in ``float`` for a robot with supports.
+        InputError: The prefix is not a C identifier, the objectives differ in anything but the contact, the joint
+            model is ``elastic``, or ``cuda`` is requested in ``float`` for a robot with supports.
         PostureError: The posture has the wrong length or is not finite.
         OutputError: ``out`` is not a folder, already contains the files, or is not writable.
         CompilerError: The compiler failed, or the results of the compiled code are wrong.  The files stay.
@@ -243,14 +243,14 @@ def default_prefix(objectives: Sequence[WorstCaseObjective]) -> str:
 
 
 def _same_robot(objective: WorstCaseObjective | Sequence[WorstCaseObjective]) -> tuple[WorstCaseObjective, ...]:
-    """Return the objectives as a tuple; raise ``InputError`` if they differ in more than the contact."""
+    """Return the objectives as a tuple; raise ``InputError`` if they differ in anything but the contact."""
     objectives = (objective,) if isinstance(objective, WorstCaseObjective) else tuple(objective)
     if not objectives:
         raise InputError("no objective is given", where="codegen", hint="give one objective for each frame")
     first = objectives[0]
     for other in objectives[1:]:
         if _without_contact(other) != _without_contact(first):
-            what = f"'{other.contact.frame}' and '{first.contact.frame}' differ in more than the contact"
+            what = f"objectives at '{first.contact.frame}', '{other.contact.frame}' differ in more than the contact"
             raise InputError(what, where="codegen", hint="export each objective separately")
     return objectives
 

@@ -35,7 +35,7 @@ class NamedObjective:
 
 
 def named_objectives(objectives: Sequence[WorstCaseObjective], prefix: str) -> tuple[NamedObjective, ...]:
-    """Return the objectives to export, with their stems.
+    """Return the objectives to export, each with the stem of its C names (:class:`NamedObjective`).
 
     If the robot has supports, the objective without supports follows each objective, with the stem ``<stem>_free``.
     An objective of several contacts becomes one objective per contact; the objective of all contacts is last.
@@ -110,8 +110,8 @@ class ExportLibrary:
 def export_library(exported: Sequence[NamedObjective]) -> ExportLibrary:
     """Return the expressions of the objectives of one robot.
 
-    ``V`` has no expression, because the C code computes it from ``H`` and ``G``.  An ``objective`` that is a multiple
-    of ``H`` has no expression either.
+    ``V`` has no expression, because the C code computes it from ``H`` and ``G``.  If ``objective`` is a multiple of
+    ``H``, the C code computes it from ``H``, so it has no expression either.
     """
     robot = exported[0].objective.robot
     model, q, n = robot.model, ca.SX.sym("q", robot.nq), ca.SX.sym("n", 3)

@@ -25,8 +25,8 @@ Array = NDArray[Any]
 
 _TYPES: dict[str, Any] = {"double": ctypes.c_double, "float": ctypes.c_float}
 # Relative tolerance for rounding errors in the comparison with the reference values of the manifest.  In float, few
-# of the seven digits are correct for a robot with supports.  Their compliance ε causes a condition number of about
-# 1/ε.
+# of the seven digits are correct for a robot with supports.  The compliance ε of the supports causes a condition
+# number of about 1/ε.
 _SELF_TEST = {"double": 1e-7, "float": 0.1}
 # Least number of rows of a batch that each thread computes.
 _LEAST_ROWS = 256
@@ -109,7 +109,7 @@ class ImpactGradient:
             SpecError: The export does not exist or is damaged.
             ManifestMismatch: The robot, the joint order or a convention of the export differs, or the library belongs
                 to another manifest.  The error names the first difference.
-            FrameNotFound: The export has no such frame.  The error lists its frames.
+            FrameNotFound: The export has no such frame.  The error lists the frames of the export.
             CompilerError: The library is missing and cannot be built.
         """
         manifest, folder = read_manifest(Path(path))

@@ -36,8 +36,8 @@ def build_manifest(
 
     The key ``frames`` has one entry for each frame; the top level repeats the keys of the first entry.  In each
     entry, the key ``free`` contains C names and self-test for the robot without its supports.  ``free`` is null if
-    the robot has no supports.  The key ``several`` belongs to the objective of several simultaneous contacts.  It
-    contains the contacts, C names and self-test of this objective.
+    the robot has no supports.  The key ``several`` contains the contacts, C names and self-test of the objective of
+    several simultaneous contacts.
     """
     first = objectives[0]
     robot, metric = first.robot, first.metric

@@ -172,7 +172,7 @@ def _merge(
 
 
 def _align(slots: list[list[int]], bundles: Mapping[int, tuple[int, ...]]) -> None:
-    """Exchange the operands of a sum or product in each lane whose order differs from the first lane."""
+    """Exchange the two operands of a sum or product in each lane whose operand order differs from the first lane."""
     first, second = slots
     for lane in range(1, len(first)):
         pairs = ((first[0], first[lane]), (second[0], second[lane]))

@@ -11,8 +11,8 @@ from impact_posture.codegen.expression_graph import Graph, Node
 _LATENCY = {"+": 4, "-": 4, "*": 4, "inv": 15, "neg": 1, "lane": 2, "const": 0, "in": 0, "gather": 1}
 # Approximate latency of functions such as sine, cycles.
 _TRIG = 40
-# Two terms are first added to each other only if this saves at least this number of cycles.  The separate addition
-# takes extra time, because it cannot be part of a fused multiply-add.
+# Two terms are added to each other before the sum only if this saves at least this number of cycles.  An addition of
+# two terms takes extra time, because it cannot be part of a fused multiply-add.
 _WORTH = 8
 
 

@@ -62,8 +62,8 @@ class CompiledController:
         tasks = len(manifest.tasks)
         memory = memoryview(self._context)
         targets = np.frombuffer(memory, dtype=float, count=TARGET * tasks).reshape(tasks, TARGET)
-        # In memory, the activation level comes after the targets.  C arrays cannot be empty, so there is at least one
-        # target.
+        # In the context of the C code, the activation level is stored behind the targets.  C arrays cannot be empty,
+        # so there is at least one target.
         self._level = np.frombuffer(memory, dtype=float, count=1, offset=8 * TARGET * max(1, tasks))
         self.targets = {task.name: row for task, row in zip(manifest.tasks, targets, strict=True)}
         self._q, self._v, self._force = np.zeros(manifest.nq), np.zeros(manifest.nv), np.zeros(6)
@@ -311,7 +311,7 @@ class CompiledController:
     def _enter(self, function: str, *times: float) -> None:
         if self._call(function, *map(ctypes.c_double, times)):
             what = f"'{function.partition('_')[0]}' at {times[0]:g} s does not follow the phase before it"
-            raise InputError(what, where="controller", hint="give phases in the order of their times, or reset it")
+            raise InputError(what, where="controller", hint="give phases in the order of their times, or call reset")
 
     def _call(self, name: str, *arguments: Any) -> int:
         return int(self._functions[name](self._context, *arguments))

@@ -66,8 +66,8 @@ def read_controller(path: Path) -> tuple[dict[str, Any], Manifest, Path]:
 def build_controller(folder: Path, manifest: dict[str, Any], generated: Sequence[str] = ()) -> Path:
     """Build ``lib<prefix>.so`` in the folder of an exported controller.
 
-    ``generated`` are additional compiler flags for the sources that are generated from the model.  These sources are
-    long and contain no loops.
+    ``generated`` are additional compiler flags for the sources that are generated from the model, which are long and
+    contain no loops.
 
     Raises:
         CompilerError: The compiler failed or is missing.

@@ -21,7 +21,8 @@ Rule = Literal["finite", "nonnegative", "positive", "limit", "amount", "share"]
 # (8).
 RULES: dict[Rule, int] = {"finite": 1, "nonnegative": 3, "positive": 6, "limit": 0, "amount": 7, "share": 14}
 
-# Name of an option of a reference flow or of an attribute of a contact, its rule, and its text.
+# Name of an option of a reference flow (``_FLOW``) or of an attribute of a contact (``_CONTACT``), its rule, and its
+# description in the header.
 _FLOW: tuple[tuple[str, Rule, str], ...] = (
     ("speed", "amount", "largest speed of an entry of q_r, rad/s or m/s"),
     ("acceleration", "amount", "largest acceleration, rad/s2 or m/s2"),
@@ -127,7 +128,7 @@ def _robust_fields(robust: ImpactRobustPosture) -> Iterator[Field]:
     yield _field("robust_gain", "nonnegative", "K, 1/s2", robust.K)
     yield _field("robust_scale", "nonnegative", "lambda; 0: measured at reset", scale)
     yield _field("robust_reach", "positive", "largest length of the term, divided by K, rad", robust.reach)
-    vanishes = "distance of each joint from a limit where the term vanishes"
+    vanishes = "distance from a position limit at which the term vanishes, for each joint"
     yield _field("robust_near", "nonnegative", vanishes, robust._near)
     yield _field("robust_band", "positive", "width of the fade of each joint; may be infinite", robust._band)
     begins = "distance from a limit at which a fade can begin, rad"

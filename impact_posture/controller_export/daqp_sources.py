@@ -34,7 +34,7 @@ FILES = {
 }
 # Largest permitted size of a file, bytes.
 _LARGEST = 1 << 20
-# Build backend that only returns the metadata that pip requires.  The real backend would run code of the
+# Build backend that only returns the metadata that pip requires.  The build backend of DAQP would run code of the
 # distribution, which takes minutes.
 _BACKEND = f"""
 import pathlib

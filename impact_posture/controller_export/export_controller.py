@@ -101,7 +101,7 @@ def export_controller(
         force: Replace an earlier export.
         generated: Additional compiler flags for the sources that are generated from the model.
         shared: Make armature and joint placements a parameter, ``numbers``.  Robots that differ only in these numbers
-            then share the code.  The code then contains the gradient.
+            can share the code, which then also contains the gradient.
         path: The folder also contains the references along this path
             (:class:`~impact_posture.path.path_reference.PathReference`) and an example.  If the path strikes, its
             contact must be the contact of ``objective``.
@@ -116,7 +116,8 @@ def export_controller(
     structure = structure_of(robot, formulation)
     if (structure.robust is None and structure.flow is None) != (objective is None):
         what = "the posture task has no objective" if objective is None else "no task uses the objective"
-        hint = "give the objective of its gradient" if objective is None else "give a posture task with a gradient"
+        needed = "the objective whose gradient the posture task follows"
+        hint = f"give {needed}" if objective is None else "give a posture task with a gradient"
         raise InputError(what, where="controller export", hint=hint)
     along = {} if path is None else render_path(structure, path_reference(robot, path, objective), prefix)
     sources = daqp_sources(Path(daqp) if daqp else None)

@@ -25,9 +25,9 @@ _TABLES = ("joint_family", "joint_q", "joint_v")
 
 
 def path_reference(robot: Robot, path: PosturePath, objective: WorstCaseObjective | None) -> PathReference:
-    """Return the references along a path in Python; the contact is the contact of the objective.
+    """Return the references along a path in Python; the path strikes with the contact of the objective.
 
-    With an objective, the references also detect the contact when the contact point stops.
+    With an objective, a contact is also detected when the contact point stops.
     """
     oracle = None if objective is None else objective.oracle.at(path.q[-1])
     rotors = robot.spec.propulsion
@@ -44,7 +44,7 @@ def render_path(s: Structure, reference: PathReference, prefix: str) -> dict[str
     path, strike = reference.path, reference.path.strike
     fault = ""
     if (path.model.nq, path.model.nv) != (s.robot.nq, s.robot.nv):
-        fault, hint = f"is not a path of {s.robot.name}", "give a path of the same robot"
+        fault, hint = f"does not have the joints of {s.robot.name}", "give a path of the same robot"
     elif len(path.t) < 2:
         fault, hint = f"has no motion ({path.reason or 'the start is the optimum'})", "leave the path out"
     elif s.flow is not None:

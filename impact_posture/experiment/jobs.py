@@ -62,7 +62,7 @@ class Job:
 
     @property
     def shown(self) -> bool:
-        """True for the first seed.  Figures and reports show only this seed, so only its time series are stored."""
+        """Whether figures and reports show this job; true for seed 0.  Time series are stored only for shown jobs."""
         return self.seed == 0
 
     @property
@@ -102,7 +102,7 @@ def controller_factory(scenario: str, free: bool = False, seed: int = 0) -> Cont
 
 
 def execute(job: Job, factory: ControllerFactory | None = None) -> tuple[tuple[Run, ...], Document]:
-    """Run a job.  Return its runs and its document.
+    """Run a job; return the runs of the job and its JSON document.
 
     By default, ``factory`` is :func:`controller_factory` of the scenario.
 
@@ -157,7 +157,7 @@ def software() -> dict[str, str]:
 
 
 def lost_control(job: Job, error: Exception) -> Document:
-    """Return the document of a failed job.  It has the status ``control lost`` and no runs."""
+    """Return the document of a failed job, with the status ``control lost`` and no runs."""
     event = {"status": "control lost", "time": getattr(error, "time", None), "what": str(error), "sign": None}
     return {"schema": SCHEMA, "scenario": job.scenario, "controller": job.controller, "mode": job.mode,
             "free": job.free, "seed": job.seed, "status": "control lost", "events": [event], "metrics": None,
@@ -168,8 +168,8 @@ def combined(metrics: list[Metrics]) -> Metrics:
     """Combine the metrics of several runs.
 
     Counts are added, and ``stops`` contains the joints of all runs.  ``peak_jump_max`` and ``peak_force`` are the
-    largest values of all runs, and ``joint`` is the worst joint of all runs.  ``rested`` is true if all runs rested.
-    All other metrics are means.
+    largest values of all runs, and ``joint`` is the worst joint of all runs.  ``rested`` is true if it is true for
+    all runs.  All other metrics are means.
     """
     first, load = metrics[0], mean_load([m.load for m in metrics])
     if len(metrics) == 1:

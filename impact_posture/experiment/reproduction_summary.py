@@ -46,7 +46,7 @@ def table_one(results: Reproduction) -> str:
 
 
 def fitted(results: Reproduction) -> str:
-    """Return a Markdown list of the values fitted to the paper, and the nominal values divided by the paper's."""
+    """Return a Markdown list: what was fitted in each scenario, and our nominal value relative to the paper."""
     lines = []
     for scenario in results.scenarios:
         paper, nominal = PAPER.get(scenario), results.row(scenario, "nominal")
@@ -106,9 +106,9 @@ def summary(results: Reproduction) -> str:
         fitted(results),
         "The paper has other robots, gains, contact models and windows, and states few of these values. Compare "
         "reductions, not values. `q_total_impact` is the integral of ‖ν‖ over fixed windows, which are the same for "
-        "every controller. Contacts are summed, and pushes are the mean of both signs.",
+        "every controller. The value is summed over contacts, or averaged over pushes with both signs.",
         "A seed above zero changes the start, the speed or force, and the friction (`[spread]` in the scenario), and "
-        "the sensor noise. The intervals contain all these effects.",
+        "the sensor noise. The intervals contain the effects of all these changes.",
         LEGEND,
     ]
     for scenario in results.scenarios:
@@ -159,7 +159,7 @@ def _held(best: ControllerRow, held: ControllerRow | None) -> str:
     return (
         " The posture does not cause this reduction: with the posture held before the impact, the reduction is only "
         f"{reduction_text(held)}. "
-        "A stiffer nominal controller is the simpler way."
+        "A stiffer nominal controller is simpler."
     )
 
 

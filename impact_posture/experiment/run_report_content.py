@@ -63,7 +63,7 @@ def run_content(folder: Path, document: Document, view: RunView, job: Job) -> Co
     if scenario.push and len(document["runs"]) < len(scenario.push.signs):
         options += ["--sign", f"{document['runs'][0]['sign']:+d}"]
     metrics, status = document["metrics"], document["status"]
-    verdict = [f"{status}: its numbers are not a result" if metrics is None else f"{status}: {_summary(metrics)}"]
+    verdict = [f"{status}: do not use its numbers" if metrics is None else f"{status}: {_summary(metrics)}"]
     verdict += [f"t = {event['time']:.2f} s: {event['what']}" for event in document["events"]]
     wanted = [] if metrics is None else table_metrics(view)
     rows = [(key, number(metrics[key]), unit, words) for key, unit, words in wanted]
@@ -129,7 +129,7 @@ def comparison_content(folder: Path, document: Document, view: RunView) -> Conte
     nominal = next((row for row in rows if row["controller"] == "nominal"), None)
     compared = [row for row in rows if row["reduction"] is not None and row is not nominal]
     lines = ["No reduction is known."] if nominal is None or not compared else [
-        "Within the impact windows, against nominal:", *(headline(row, nominal) for row in compared)
+        "Within the impact windows, compared with nominal:", *(headline(row, nominal) for row in compared)
     ]  # fmt: skip
     seeds = len(document["seeds"])
     means = statistic(seeds, [Interval(**interval) for row in rows for interval in row["metrics"].values()])

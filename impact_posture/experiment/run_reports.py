@@ -80,7 +80,7 @@ def run_view(job: Job, part: Document, series: Series) -> RunView:
 
 
 def try_report(folder: Path, scenario: str, *, meshes: bool) -> str:
-    """Write the report of a folder.  If that fails, return the reason.  An exception would discard the runs."""
+    """Write the report of a folder; return the reason if that fails, because an exception would discard the runs."""
     try:
         write_run_report(folder, scenario, meshes=meshes, force=None)
     except Exception as error:

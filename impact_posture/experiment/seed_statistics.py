@@ -138,7 +138,7 @@ def headline(row: Document, nominal: Document) -> str:
 
 
 def _outcome(row: Document, nominal: Document) -> str:
-    """Return the outcome in words.  A change within its interval counts as zero."""
+    """Return the outcome in words.  A change smaller than the half width of its interval counts as zero."""
     intervals = {name: Interval(**interval) for name, interval in row["change"].items()}
     doubtful = {name for name, each in intervals.items() if each.shown is not None and abs(each.mean) <= each.shown}
     before = {name: float(interval["mean"]) for name, interval in nominal["metrics"].items()}

@@ -139,7 +139,7 @@ class BatchMetric:
         return value, grad
 
     def _normalized(self, xp: Any, q: Any) -> tuple[Any, Any]:
-        """Return ``u(q)``, and the factor of each entry of ``q``, shape (N, nq)."""
+        """Return ``u(q)``, with normalized quaternions and cosine-sine pairs, and ``u(q)/q``, shape (N, nq)."""
         scales = xp.ones_like(q)
         for names, at, _ in self._joints:
             unit = slice(at + len(names) - (4 if "qw" in names else 2), at + len(names))
@@ -187,7 +187,7 @@ def _joints(q_names: Sequence[str]) -> Iterator[tuple[tuple[str, ...], int, int]
 
 
 def _package(array: Any) -> Any:
-    """Return the module of an array, which has the function ``from_dlpack``; NumPy for lists and numbers."""
+    """Return the package of an array, such as PyTorch or JAX; NumPy for lists and numbers."""
     if hasattr(array, "__array_namespace__"):
         return array.__array_namespace__()
     return sys.modules[type(array).__module__.partition(".")[0]] if hasattr(array, "__dlpack__") else np

@@ -26,7 +26,7 @@ class QuantityRow(NamedTuple):
     meaning: str
 
     def cells(self, number: Callable[[float | None], str]) -> tuple[str, ...]:
-        """Return the row as texts in the order of :data:`HEAD`; ``number`` writes a value."""
+        """Return the row as texts in the order of :data:`HEAD`; ``number`` formats a value."""
         return self.key, number(self.before), number(self.after), self.unit, self.meaning
 
 
@@ -51,9 +51,9 @@ def answer_key(document: dict[str, Any]) -> str:
 def quantity_rows(impact: ResolvedImpact, initial: dict[str, Any], optimal: dict[str, Any]) -> list[QuantityRow]:
     """Return the rows of the table with the values at the start and at the optimum.
 
-    The first rows state the effects on base, joints and contact at the given speed and friction.  The fastest
-    approach, the norm of the jump, the objective, and H to E follow.  Unknown quantities have no row.  ``initial``
-    and ``optimal`` are the blocks of ``result.json``.
+    The first rows state the effects on base, joints and contact at the given speed and friction.  The next rows are
+    the fastest approach, the norm of the jump, the objective, and H, G, V, S and E.  Unknown quantities have no row.
+    ``initial`` and ``optimal`` are the blocks of ``result.json``.
     """
     named = quantities(impact.metric)
     kind, per_speed = impact.objective.kind, named[2][1]
@@ -92,5 +92,5 @@ def _felt_rows(impact: ResolvedImpact, initial: dict[str, Any], optimal: dict[st
 
 
 def _row(key: str, values: list[Any], unit: str, meaning: str) -> list[QuantityRow]:
-    """Return the row of two values; no row if a value is unknown."""
+    """Return a row with the two ``values``, or no row if a value is unknown."""
     return [] if None in values else [QuantityRow(key, values[0], values[1], unit, meaning)]

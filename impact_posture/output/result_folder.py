@@ -63,8 +63,7 @@ def finish_result(
     """
     export = partial(_export, folder, prepared, postures) if codegen else partial(Written, folder)
     scene: ReportScene | None = None
-    # The C code takes longest.  Another process therefore starts to write this code before this process imports
-    # matplotlib.
+    # Writing the C code takes longest.  Another process therefore starts it before this process imports matplotlib.
     with fork_call(export) if codegen and jobs > 1 else nullcontext(export) as exported:
         from impact_posture.output.plot import draw_all, drawable
         from impact_posture.output.report.result_report import result_scene, write_result_report

@@ -116,7 +116,7 @@ def load_result(folder: Path) -> tuple[Prepared, ResultView, dict[str, Any]]:
 
 
 def _refuse(text: str) -> int:
-    raise ValueError(f"{shown(text)} is not a number of a result")
+    raise ValueError(f"{shown(text)} is too large for a number in a result")
 
 
 def _whole(text: str) -> int:
@@ -165,7 +165,7 @@ def result_view(prepared: Prepared, postures: SolvedPostures, motion: PosturePat
 def _collisions(prepared: Prepared, *postures: Array) -> Any:
     """Return the colliding shapes at each posture, without shapes that held joints fix to each other.
 
-    If collisions are constrained, there are none, and the result is empty.
+    The result is empty if the problem has collision constraints, because they prevent all collisions.
     """
     problem = prepared.problem
     if problem.surroundings is not None:

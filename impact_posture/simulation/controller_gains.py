@@ -53,8 +53,8 @@ class RobustTerm(StrictTable):
     Attributes:
         gain: K of the term, 1/s².  The curvature of the objective scales the term, so K is a stiffness like ``kp``.
         ramp: Time in which the term is switched on gradually, s.
-        fade: Two distances from a position limit, rad (m).  Beyond the larger distance, the term has its full size.
-            Towards the smaller distance, the term falls to zero.
+        fade: Two distances from a position limit, rad (m).  The term has its full size at the larger distance, and
+            falls to zero at the smaller distance.
     """
 
     gain: Positive

@@ -13,9 +13,9 @@ from impact_posture.simulation.setup import Setup
 
 # The velocity jump is measured within this time after the first touch, s.
 JUMP = 0.015
-# The same time in words.
+# Words for the time ``JUMP``.
 AFTER_TOUCH = f"{1e3 * JUMP:g} ms of the touch"
-# The recovery window in words.
+# Words for the recovery window.
 UNTIL_RECOVERY = f"until {RECOVERY:g} s after each impact began"
 # A command is saturated if its distance from a limit is below this share of the range.
 _NEAR = 1e-3
@@ -35,7 +35,8 @@ class Metrics:
             contact).  For pushes, the largest ``‖ν‖`` within the window.
         peak_jump_max: Like ``peak_jump``, but the largest value over the contacts.
         peak_recovery: Like ``peak_jump``, but within the whole recovery window.
-        peak_force: Largest normal force within the impact windows, N.  For pushes, the force of the push.
+        peak_force: Largest normal force within the impact windows, N.  For pushes, ``peak_force`` is the force of the
+            push.
         saturation_inside: Time within the impact windows during which a rotor or a joint is at a control limit, s.
         saturation_outside: Like ``saturation_inside``, but outside the impact windows, s.
         saturation_rotors: Like ``saturation_inside``, but only for rotors, s.
@@ -164,9 +165,9 @@ def before(series: Series, window: Window) -> int:
 def impact_load(setup: Setup, series: Series, window: Window) -> ImpactLoad:
     """Return the effects on base, joints and contact within :data:`JUMP` after the start of an impact window.
 
-    The jump is the largest ``‖ν(t) − ν⁻‖`` in this time.  For pushes, it is the largest ``‖ν‖`` in the window.  The
-    changes of base and joints are the largest changes in the same time.  The peak force is the largest force in the
-    window.
+    The jump is the largest ``‖ν(t) − ν⁻‖`` within :data:`JUMP`, or for pushes, the largest ``‖ν‖`` within the window.
+    The changes of base and joints are the largest changes in the same interval.  The peak force is the largest force
+    in the window.
     """
     end, inside = window.end if setup.scenario.push else window.begin + JUMP, series.slice(window.begin, window.end)
     ticks, k = series.slice(window.begin, end), before(series, window)

@@ -31,9 +31,9 @@ OFFLINE_STARTS = 8
 # moves half as far, and its objective is 1 % larger.  The humanoid thus avoids postures in which its controller loads
 # the legs unevenly.
 _NEARNESS = 0.005
-# Margins, tried in this order, because large margins are not feasible from every start.  The first number of a pair
-# is the distance from the joint stops, rad (m), so that no joint rests on a stop.  The second number is the distance
-# of the center of mass from the edges of the support polygon, m, so that an impact does not tip the robot.
+# Pairs of margins, tried in this order, because large margins are not feasible for every start posture: distance from
+# the joint stops, rad (m), so that no joint rests on a stop; and distance of the center of mass from the edges of the
+# support polygon, m, so that an impact does not tip the robot.
 _MARGINS = ((0.1, 0.05), (0.0, 0.05), (0.0, 0.025), (0.0, 0.0))
 # Distance from the joint stops of a robot that falls, rad (m), so that the impact does not straighten its legs.
 _LANDING_MARGIN = 0.5
@@ -92,8 +92,8 @@ def offline_posture(
       standing robot lifts or slides during the impact.
     - A robot that falls touches the surface with its feet, which are as far apart as in the start posture.
 
-    If the search does not reach a posture with all constraints, it drops first the tilt and shift, then the demand on
-    the feet, and then the constraints on collisions.  The ``note`` of the result states the dropped constraints.
+    If no posture satisfies all constraints, these constraints are dropped in this order: tilt and shift of the
+    surface, feet that stay during the impact, collisions.  The ``note`` of the result states the dropped constraints.
 
     Raises:
         Infeasible, SolverFailed: The same errors as in :func:`impact_posture.posture.search.multistart.solve`.

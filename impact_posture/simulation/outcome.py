@@ -28,8 +28,8 @@ OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)
 _EVERY = 25
 # Largest number of pairs of touching links that a warning lists.
 _MOST = 4
-# A link has moved through a surface if its joint origin is deeper than this behind the surface, m.  The compression
-# of a contact is smaller.
+# A link has moved through a surface if its joint origin is farther than this behind the surface, m.  Contacts are
+# compressed less than this.
 _DEEP = 0.02
 # The prediction fits if the measured velocity jump divided by the predicted velocity jump is in this range.
 _FITS = (0.67, 1.5)
@@ -187,7 +187,7 @@ def _losses(setup: Setup, run: Run) -> list[Event]:
         events.append(Event("control lost", float(series.t[np.argmax(relaxed)]), words))
     begin, length = _longest(series.held)
     if length * period > bounds.held + 1e-9:
-        words = f"the controller had no command for {length * period:.3g} s, the last one was held,"
+        words = f"the controller had no command for {length * period:.3g} s, so the last command was held,"
         events.append(Event("control lost", float(series.t[begin]), words))
     if run.away is not None:
         events.append(Event("control lost", run.away, "the state ran away"))

@@ -42,8 +42,8 @@ class Prediction:
         measured: Measured jump (``peak_jump`` in :class:`~impact_posture.simulation.metrics.Metrics`).
         ratio: ``measured`` divided by ``coulomb`` (for pushes, by ``frictionless``); ``None`` if the divisor is
             almost zero.
-        predicted_impact: Effects on base, joints and contact that belong to ``coulomb``.  For pushes, the effects
-            belong to ``frictionless``.  The peak force is known only for pushes.
+        predicted_impact: Predicted effects on base, joints and contact, for the jump ``coulomb`` (for pushes,
+            ``frictionless``).  The peak force is known only for pushes.
         measured_impact: Measured effects on base, joints and contact.
     """
 

@@ -45,7 +45,7 @@ class Run:
         sign: Sign of the push or throw; 1 for contacts.
         waited: Start of the impact window of the push or throw, s; NaN for contacts.
         rested: Whether the robot was at rest before the push.  If the robot does not come to rest, the push starts
-            after the time ``patience`` of the scenario.  The metrics then contain the motion before the push.
+            after the time ``patience`` of the scenario, and the metrics contain the motion before the push.
         away: Time at which the state diverged and the run ended, s; ``None`` if the state did not diverge.
     """
 
@@ -128,7 +128,7 @@ class _Loop:
             new = take(count, reference)
             speeds = np.concatenate([speeds, new])
             if new.size < count:
-                # Figures need at least two ticks, so raise the error.
+                # Without two ticks, there is nothing to show in figures.
                 if self.recorder.ticks < 2:
                     raise SimulationDiverged(self.t, where=self.setup.robot.name)
                 self.away = self.t
@@ -139,7 +139,7 @@ class _Loop:
     def check_length(self, t: float) -> None:
         """Raise an InputError if a run of duration ``t`` (s) has fewer than two or more than :data:`_MOST` ticks."""
         if not 2 * self.period <= t <= _MOST * self.period:
-            fault, hint = f"more than {_MOST:.0e}", "lower the contacts' count or the times, or raise control.period"
+            fault, hint = f"more than {_MOST:.0e}", "make contacts fewer or shorter, or raise control.period"
             if t < 2 * self.period:
                 fault, hint = "fewer than two", "lower control.period"
             what = f"a run of {t:g} s has {fault} ticks of {self.period:g} s"
@@ -218,7 +218,7 @@ def _pushes(loop: _Loop, task: SinglePush | Throw, signs: Sequence[int], mode: M
     """Let the robot come to rest once, then push it with each sign.  The second sign runs in a forked process."""
     length = task.window if isinstance(task, Throw) else task.duration
     loop.check_length(task.settle + task.patience + length + task.after)
-    # The push must be later than BRACE, so that all controllers begin to prepare before the push.
+    # All controllers begin to prepare for the push at the time BRACE, so the push must be later.
     rested = _settle(loop, task, max(task.settle, BRACE + loop.period), [loop.driver.brace])
     if mode == "held":
         # Hold the reached posture without the term, and wait until the robot comes to rest again.
@@ -262,7 +262,8 @@ def _settle(loop: _Loop, task: SinglePush | Throw, least: float, brace: list[Cal
             return False
         if brace and loop.t >= BRACE - SAME:
             brace.pop()()
-        # Nothing can change before the earliest of these times, so run all ticks until then in one call.
+        # Run all ticks until the earliest of the times ``waits`` in one call, because nothing can change before this
+        # time.
         waits = [max(least, loop.t + task.still - still), end, *([BRACE] if brace else [])]
         for speed in loop.ticks(min(map(loop.until, waits))):
             still = still + loop.period if speed < task.quiet else 0.0

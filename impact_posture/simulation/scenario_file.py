@@ -36,8 +36,8 @@ class RepeatedContacts(StrictTable):
 
     Attributes:
         frame: Frame of the shape that touches the surface.
-        others: Frames of shapes that touch the surface at the same time.  If there are any, the robot falls freely
-            from the start, and lands on ``frame`` and ``others``.
+        others: Frames of further shapes that touch the surface at the same time.  If not empty, the robot falls
+            freely from its start posture, and lands on ``frame`` and ``others``.
         surface: Name of the surface.
         speed: Speed of the reference at the surface, m/s.
         acceleration: Acceleration of the reference during the approach to the surface and during the return, m/s².
@@ -75,7 +75,7 @@ class SinglePush(Settling):
     Attributes:
         frame: Frame that is pushed.
         force: Force of a push with sign 1, world, N.
-        duration: Duration of the push, s.  The impact window has the same duration.
+        duration: Duration of the push and of the impact window, s.
     """
 
     frame: str

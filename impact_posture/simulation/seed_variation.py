@@ -85,7 +85,7 @@ def _scaled(scenario: Scenario, speed: float, friction: float) -> Scenario:
 
 
 def _start(setup: Setup, size: float, generator: np.random.Generator) -> Array:
-    """Return a random start near ``setup.q``; the base of a flying robot or the feet of a standing robot stay."""
+    """Return a random start posture near ``setup.q`` with the same base (flying robot) or feet (standing robot)."""
     robot, model = setup.robot, setup.robot.model
     for _ in range(_DRAWS):
         step = size * generator.uniform(-1, 1, robot.nv)

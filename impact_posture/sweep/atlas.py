@@ -92,7 +92,7 @@ class Atlas:
             if read_bytes(manifest) != text.encode():
                 self.damaged.update([] if other else [MANIFEST])
                 write_whole(manifest, text)
-                # The lock of the old file does not hold for the new file.
+                # Lock the new file too, because the lock above belongs to the replaced file.
                 locks.enter_context(used_alone(self.folder, manifest))
             for place in (_DATA, _FIRST_PASS) if other else ():
                 for shard in (self.folder / place).glob("case=*/shard-*.parquet"):

@@ -60,8 +60,8 @@ class CaseSolver:
     def normal_and_speed(self, values: Mapping[str, Any]) -> tuple[Any, float]:
         """Return normal and speed for ``values`` of the grid axes; normal, speed and target determine the problem."""
         settings = self._case.settings
-        # A speed in the problem can select the objective and add a constraint on the approach speed.  A speed of the
-        # grid must have neither effect.
+        # A speed in the problem can select the objective and add a constraint on the approach speed.  A speed on a
+        # grid axis must neither select the objective nor add this constraint.
         speed = Unstated(values["speed"]) if "speed" in values else settings.speed
         return values.get("normal", settings.normal), speed
 
@@ -108,8 +108,8 @@ class CaseSolver:
     def walk(self, template: ConstrainedProblem) -> Walk:
         """Return the :class:`Walk` that solves points of a shard, starting from the problem ``template``.
 
-        A nonlinear program with the same expressions is reused.  Each walk extends its own copy of the program.
-        Therefore, the rounding errors of a walk do not depend on shards that this process solved before.
+        A nonlinear program with the same expressions is reused.  Each :class:`Walk` extends its own copy of the
+        program, so its rounding errors do not depend on shards that this process solved before.
         """
         key = f"{template.objective.structure}\n{template.structure}"
         built = kept(self._programs, key, lambda: build_nlp(template, compile="never"), _KEPT)

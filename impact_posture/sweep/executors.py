@@ -36,7 +36,7 @@ class DaskWorkers(Executor):
         self._last_workers = time.monotonic()
 
     def check(self) -> None:
-        """Ask the scheduler for its workers, because a scheduler that is stopped keeps its connections open.
+        """Ask the scheduler for its workers, because connections stay open even if the scheduler hangs.
 
         Raises:
             TimeoutError: The scheduler does not answer, or its workers are lost.
@@ -77,7 +77,7 @@ def dask_cluster(address: str) -> Iterator[Executor]:
 
 @contextmanager
 def _unlogged(*names: str) -> Iterator[None]:
-    """Hide the log messages of other packages, because these packages also raise the errors in the messages."""
+    """Hide the log messages of the packages ``names``, because they also raise the logged errors."""
     loggers = [logging.getLogger(name) for name in names]
     levels = [logger.level for logger in loggers]
     for logger in loggers:

@@ -24,7 +24,7 @@ from impact_posture.posture.search.multistart import distinct, solve
 from impact_posture.system.arrays import Array
 
 # ``_ROUNDS`` is the maximum number of rounds that add missing body pairs to the nonlinear program of a point.  While
-# it is unknown whether the point is feasible, the maximum is ``_UNSURE``.
+# it is unknown whether the point is feasible, at most ``_UNSURE`` rounds are made.
 _ROUNDS, _UNSURE = 8, 3
 # Postures whose joints differ by more than this (rad, m) may belong to different optima.
 SWITCH = 0.2
@@ -77,8 +77,8 @@ class Walk:
     def __init__(
         self, template: ConstrainedProblem, settings: ProblemSettings, nlp: PostureNLP, timer: Timer
     ) -> None:
-        # The caller identifies the template by its ``id``.  While this reference exists, no other object gets the
-        # same ``id``.
+        # The caller identifies the template by its ``id``.  ``_template`` keeps the object alive, so that no other
+        # object gets the same ``id``.
         self._template, self.settings, self.timer = template, settings, timer
         self.problem, self.nlp = template, nlp
         self._relaxed: ElasticProgram | None = None
@@ -154,9 +154,9 @@ class _Attempt:
     ) -> PointResult | None:
         """Return the best certified result, or ``None``.
 
-        With ``alone``, the runs start only from ``guesses``.  Otherwise, they also start from the given posture.  If
-        the results differ, random starts are added.  After each of at most ``rounds`` rounds, the program gets the
-        body pairs that violate their clearance at the results.
+        With ``alone``, the runs start only from ``guesses``.  Otherwise, a run also starts from the given posture of
+        the problem.  If the results differ, random starts are added.  After each of at most ``rounds`` rounds, the
+        program gets the body pairs that violate their clearance at the results.
         """
         price = SLACK_PRICE
         for _ in range(rounds):

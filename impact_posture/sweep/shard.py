@@ -61,8 +61,8 @@ def revise_shard(
 ) -> ShardResult:
     """Second pass: improve the points of a shard, starting from the postures of neighboring points.
 
-    ``content`` is the file of the shard after the first pass.  ``beside`` maps the neighboring points in other shards
-    to their postures after the first pass.
+    ``content`` is the shard file that the first pass (:func:`solve_shard`) wrote.  ``beside`` maps the neighboring
+    points in other shards to their postures after the first pass.
     """
     return _passed(sweep, key, index, 2, read_shard(content), lambda shard: shard.revise(beside))
 
@@ -102,7 +102,7 @@ class _Shard:
             violations = [result.violation for result in before if result.violation]
             beside = 0.0 if guesses else min(violations, default=0.0)
             self.results.append(search(*self._at(point), guesses, beside))
-        # The optimum of a later point may lead to a better optimum at earlier points.
+        # From the optimum of a later grid point, the solver may reach a better optimum at earlier grid points.
         for point in reversed(self._points):
             start = self.results[point - first].start
             if start is not None:
@@ -163,7 +163,7 @@ class _Shard:
             last = walk, place
 
     def _improve(self, point: int, start: Start) -> bool:
-        """Try to improve a point from the posture of a neighbor.  Return whether the point improved."""
+        """Solve a grid point from the posture of a neighbor; return whether its result improved."""
         index = point - self._points.start
         known = self.results[index]
         self.results[index] = improve(*self._at(point), known, start)

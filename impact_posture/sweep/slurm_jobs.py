@@ -19,14 +19,14 @@ from impact_posture.errors import InputError, WorkerDied
 from impact_posture.system.optional_package import import_extra
 from impact_posture.system.processes import undone
 
-# Period of the search for results, and of the questions to Slurm, s.
+# Time between two searches for results, and between two queries of the job queue, s.
 _RESULTS, _QUESTIONS = 1, 10
-# A file of another machine may appear this time after the end of its job, s.
+# Longest delay with which a file that another machine wrote appears after the end of its job, s.
 _FILE_DELAY = 30
-# A command of Slurm gives up after 10 s if the controller does not answer.  Time for a question, and for the last
-# command, s.
+# Time limits for ``squeue``, and for ``scancel`` at the end, s.  A Slurm command itself gives up after 10 s without
+# an answer.
 _ANSWER, _LEAVING = 20, 5
-# Longest time without an answer or a result, s.  A backup controller takes over after 120 s.
+# Longest time without an answer or a result, s.  If the Slurm controller fails, its backup takes over after 120 s.
 _LONGEST_SILENCE = 180
 
 
@@ -128,7 +128,7 @@ class SlurmJobs(Executor):
                     self._end(future, WorkerDied("slurm", what))
 
     def _collect(self) -> bool:
-        """Pass the results on that are written, and return whether there were any."""
+        """Pass on the results that jobs have written; return whether there is a new result."""
         with suppress(OSError):
             # This makes NFS read the folder again.
             self._folder.chmod(self._folder.stat().st_mode)

@@ -165,7 +165,7 @@ class Sweep:
         return case, range(first, min(first + self.shard, self.grid.size))
 
     def beside(self, shard: int) -> dict[int, list[int]]:
-        """Return the grid points beside a shard: number of the other shard → points of the other shard."""
+        """Return the grid points next to the points of a shard: number of another shard → its points."""
         case, points = self.span(shard)
         neighbors: dict[int, list[int]] = {}
         for other in sorted({other for point in points for other in self.grid.around(point)}.difference(points)):
@@ -211,7 +211,7 @@ def read_sweep(path: Path) -> Sweep:
             where=where,
             hint="remove these keys",
         )
-    # Unlike a speed of the problem, a speed of the grid must not select the objective.
+    # A speed in the problem can select the objective, but a speed on a grid axis must not.
     stated = {name: value for name, value in (problem | first).items() if name != "speed" or "speed" not in first}
     cases = []
     for combination in product(*(values[name] for name in outer)):
@@ -241,7 +241,8 @@ def _values(name: str, axis: Any) -> tuple[Any, ...]:
         # Round, so that values such as 0.1 and 0 are exact.
         even = [low + (high - low) * k / (count - 1) for k in range(count)]
         return tuple(0.0 if abs(v) < 1e-12 * abs(high - low) else float(f"{v:.12g}") for v in even)
-    # Keep larger integers, because they may overflow as a float.  The check of the setting rejects them later.
+    # Keep larger integers, because they may overflow as a float.  The check of the setting rejects these integers
+    # later.
     return tuple(float(v) if name in _INNER and type(v) is int and abs(v) <= LARGEST else v for v in axis)
 
 

@@ -24,7 +24,7 @@ _Values = tuple[Finite, ...] | tuple[tuple[Finite, ...], ...]
 
 
 def _alike(values: Any) -> bool:
-    """Return whether the values of an axis exist, and have the same number of entries."""
+    """Return whether there are values, and all of them are numbers or vectors of the same length."""
     return len({len(value) if isinstance(value, tuple) else 0 for value in values}) == 1
 
 
@@ -127,9 +127,9 @@ def check_key(folder: Path, key: str) -> None:
     other = (
         "another version"
         if read_manifest(folder).version != __version__
-        else "another sweep, or other code or robots"
+        else "another sweep, other code or other robots"
     )
-    hint = "choose another `out`, or `force` to replace them"
+    hint = "choose another `out`, or give `force` to replace them"
     raise OutputError(f"contains results of {other}", where=str(folder), hint=hint)
 
 

@@ -16,8 +16,8 @@ from impact_posture.sweep.sweep_file import Sweep
 from impact_posture.system.optional_package import import_extra
 
 Progress = Callable[[int, int], None]
-# Maximum number of shards that are submitted and not yet written.  A larger number takes more memory.  With a smaller
-# number, workers may have to wait for the next shard.
+# Maximum number of shards that are submitted and not yet written.  More shards take more memory.  With fewer shards,
+# workers may have to wait.
 IN_HAND = 64
 # If no shard finishes within this time, s, the executor is checked.
 _PAUSE = 5.0
@@ -37,7 +37,7 @@ class SweepRun:
         solver_s: Sum of the wall times that the workers spent in IPOPT, s.
         total_s: Sum of the wall times of all shards, s.
         damaged: Files that were damaged or belonged to another sweep, as paths below the folder.  The run replaced
-            the files that it needed.
+            the files of its own shards.
     """
 
     folder: Path

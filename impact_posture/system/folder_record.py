@@ -1,8 +1,8 @@
 """Record of the files that this program wrote into a folder, with their SHA-256.
 
 The record is the file ``.impact-posture.json`` in the folder.  A file is foreign if the record does not list it, and
-changed if its SHA-256 differs from the record.  Records of version 0.2 contain no SHA-256.  Their files count as
-unchanged, because changes cannot be detected.
+changed if its SHA-256 differs from the record.  Files in a record of version 0.2, which contains no SHA-256, count as
+unchanged.
 """
 
 from __future__ import annotations

@@ -20,8 +20,8 @@ _Result = TypeVar("_Result")
 
 # Memory that the calls may allocate, bytes: 1.5 times the memory for the largest mesh file.
 MOST_MEMORY = 3 << 30
-# A call that sleeps this long, s, waits for a pipe or a device.  A process that waits for a disk does not sleep,
-# except with FUSE.
+# If a call sleeps longer than this, s, it waits for a pipe or a device.  A process that waits for a disk does not
+# sleep, except with FUSE.
 _LONGEST_SLEEP = 1.0
 # Linux function in which a process sleeps while it waits for a file system of FUSE, such as sshfs.
 _FUSE = "request_wait_answer"
@@ -39,7 +39,7 @@ class CallTimedOut(CallFailed):
 
 
 class _Outcome(NamedTuple, Generic[_Result]):
-    """Result or exception of a call, and whether the copy lacks memory for another call."""
+    """Result or exception of a call; ``last`` is true if the forked process cannot make another call."""
 
     result: _Result | Exception
     last: bool
@@ -58,12 +58,12 @@ def isolated_calls(
     Raises:
         ImpactPostureError: The system cannot start a process.
     """
-    if multiprocessing.current_process().daemon:  # Such a process, for example of a cluster, must not start others.
+    if multiprocessing.current_process().daemon:  # A daemon, such as a cluster worker, must not fork.
         yield from (_result(function, item) for item in items)
         return
 
     def outcomes() -> Iterator[_Outcome[_Result]]:
-        # This process reports the errors of the copy.
+        # The parent process reports crashes of this copy.
         faulthandler.disable()
         signal.signal(signal.SIGPROF, signal.SIG_DFL)
         os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
@@ -123,7 +123,7 @@ def _received(copy: Copy[_Outcome[_Result]], seconds: float) -> _Outcome[_Result
     try:
         outcome = copy.receive()
         return _Outcome(CallFailed(_TOO_LARGE), True) if isinstance(outcome.result, MemoryError) else outcome
-    except MemoryError:  # The copy could not send its result.
+    except MemoryError:  # The forked process could not send its result.
         return _Outcome(CallFailed(_TOO_LARGE), True)
     except WorkerDied:
         copy.process.join()

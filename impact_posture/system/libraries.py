@@ -243,8 +243,8 @@ def cache_folder(*parts: str) -> Path:
 def source_key(content: Iterable[str], *packages: str) -> str:
     """Return a short hash of everything that compiled code depends on.
 
-    The hash includes the texts ``content``.  The hash also includes the source code of ``packages`` below
-    ``impact_posture``, because this source code generates the compiled code.
+    It includes the texts in ``content`` and the source code of ``packages`` below ``impact_posture``, which generates
+    the compiled code.
     """
     text = "\n".join([__version__, *content, *map(_source_hash, packages)])
     return hashlib.sha256(text.encode()).hexdigest()[:32]

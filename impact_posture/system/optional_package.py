@@ -13,7 +13,7 @@ from impact_posture.errors import InputError
 def import_extra(module: str, extra: str = "", name: str = "") -> Any:
     """Return a module; raise InputError with the pip command if its package (``name``) is not installed.
 
-    Without ``extra``, no extra of this package installs the module.
+    ``extra`` is the extra of this package that installs the module; empty if there is none.
     """
     try:
         return import_module(module)

@@ -32,7 +32,7 @@ from impact_posture.system.scratch_folder import RECORD, SCRATCH, remove_killed,
 
 # Number of foreign files that a message names.
 _SHOWN = 3
-_EXISTS = "choose another `out`, or `force` to replace it"
+_EXISTS = "choose another `out`, or give `force` to replace it"
 
 
 def check_output(out: Path, *, force: bool, kind: Kind) -> None:
@@ -110,8 +110,8 @@ def whole_folder(out: Path, *, force: bool, kind: Kind, products: Sequence[str] 
 def added_files(folder: Path, *, force: bool) -> Iterator[Path]:
     """Yield a temporary folder; after the block, its files move to ``folder`` and into the record of ``folder``.
 
-    An existing file is replaced if this program wrote it and nobody changed it, or if ``force`` is true.  Otherwise,
-    and after any error, all files of ``folder`` stay as they were.
+    An existing file is replaced if this program wrote it and nobody changed it, or if ``force`` is true.  If an
+    existing file must not be replaced, or after any other error, no file of ``folder`` changes.
 
     Raises:
         OutputError: A file of the user would be replaced, or ``folder`` cannot be written.
@@ -136,7 +136,7 @@ def added_files(folder: Path, *, force: bool) -> Iterator[Path]:
 
 
 def _unwritable(out: Path, error: OSError, hint: str) -> OutputError:
-    """Return the error for a folder that cannot be written.  The error names the cause if this is another file."""
+    """Return the error for a folder that cannot be written.  If another file causes it, the error names this file."""
     cause = Path(os.fsdecode(error.filename) if isinstance(error.filename, str | bytes) else out).absolute()
     whole = out.absolute()
     inside = whole in (cause, *cause.parents) or cause == whole.parent
@@ -184,7 +184,7 @@ def _check_replaceable(folder: Path, name: str, path: Path, force: bool) -> None
         raise OutputError("is a folder", where=where, hint="move it away")
     if not force and not is_own(folder, name, path):
         fault = "was not written by this program, or was changed since"
-        raise OutputError(fault, where=where, hint="move it away, or `force` to replace it")
+        raise OutputError(fault, where=where, hint="move it away, or give `force` to replace it")
 
 
 def _link(source: Path, target: Path) -> None:
@@ -256,7 +256,7 @@ def _replace(beside: Path, out: Path, force: bool, kind: Kind) -> None:
             raise
         return
     # scratch_folder does not remove a folder of this name.  If the process is killed between the two renames, the old
-    # result remains there.
+    # result remains in ``old``.
     old = out.with_name(f"{out.name}.old-{secrets.token_hex(4)}")
     os.rename(out, old)
     try:

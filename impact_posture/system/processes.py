@@ -119,9 +119,9 @@ def process_pool(workers: int) -> Iterator[Executor]:
 def fork_map(function: Callable[[int], _Result], count: int, jobs: int) -> Iterator[Iterator[tuple[int, _Result]]]:
     """Yield ``(index, function(index))`` for each index below ``count``, in the order in which the calls finish.
 
-    The calls run in forked processes if ``jobs`` is more than one and the system can fork.  Otherwise, they run in
-    this process, one after the other.  All workers end with the block, also after Ctrl-C.  On Linux, all workers also
-    end if this process is killed.
+    The calls run in forked processes if ``jobs`` is more than one and the system can fork.  Otherwise, the calls run
+    in this process, one after the other.  All workers end with the block, also after Ctrl-C.  On Linux, all workers
+    also end if this process is killed.
 
     Raises:
         WorkerDied: A worker was killed, for example for lack of memory.
@@ -171,7 +171,7 @@ def fork_call(function: Callable[[], _Result]) -> Iterator[Callable[[], _Result]
     """Start ``function()`` in a copy of this process and yield a function that waits for its result.
 
     Only a fork can copy the state of physics engines and solvers.  Exceptions in the copy are raised in this process.
-    The copy ends with the block.
+    The copy ends at the end of the ``with`` block.
 
     Raises:
         OSError: The system cannot fork.

@@ -59,12 +59,12 @@ def scratch_folder(parent: Path | None = None, mode: int = 0o700) -> Iterator[Pa
             # On file systems without locks, the folders of killed processes are not removed.
             with suppress(OSError):
                 fcntl.flock(record, fcntl.LOCK_EX)
-            # Lock the record before writing it.  Until then, the record is empty, and other processes ignore it.
+            # Lock the record before writing it, because other processes ignore an empty record.
             content = {"schema": SCHEMA, "host": os.uname().nodename, **made_by()}
             try:
                 os.write(record, json.dumps(content).encode())
             except OSError as error:
-                # ``os.write`` does not know the name of the file.
+                # An error of ``os.write`` does not contain the name of the file.
                 raise OSError(error.errno, error.strerror, str(folder)) from None
             yield folder
         finally:

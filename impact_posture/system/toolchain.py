@@ -100,7 +100,8 @@ def run_compilers(commands: Sequence[list[str]], folder: Path) -> None:
 
 def _start(command: list[str], folder: Path, guard: int) -> subprocess.Popen[str]:
     pipe = subprocess.PIPE
-    # A killed compiler leaves temporary files behind.  Put them into the folder of the output, which is also removed.
+    # A killed compiler leaves temporary files behind, so use the folder of the output for them, which is removed
+    # afterwards.
     temporary = (folder / command[command.index("-o") + 1]).absolute().parent
     try:
         return subprocess.Popen(

@@ -14,9 +14,9 @@ class Actuators:
     """Actuation matrix ``G = blkdiag(G_b, I)``, with pseudo-inverse, null space and control limits.
 
     ``G_b`` (6 × rotors) maps rotor thrusts to the wrench on the base, in base axes.  A generalized force
-    ``p = [p_b; p_joints]`` can be produced only if ``blindᵀ p_b = 0``.  These are 6 equations for a legged robot and
-    none for six independent rotors.  The controls are then ``u = [G_b⁺ p_b + spare w; p_joints]``.  With redundant
-    rotors, ``w`` selects one of the possible thrust vectors.
+    ``p = [p_b; p_joints]`` can be produced only if ``blindᵀ p_b = 0``.  ``blind`` has 6 columns for a legged robot
+    and none for six independent rotors.  The controls are then ``u = [G_b⁺ p_b + spare w; p_joints]``.  With
+    redundant rotors, ``w`` selects one of the possible thrust vectors.
 
     Attributes:
         rotors: Number of rotors.

@@ -175,8 +175,8 @@ class Assembly:
         qp.A[thrusts, self._w] = actuators.spare
         self._A_hard, self._A_controls = qp.A[hard, :nv], qp.A[controls]
         self._free_blind, self._known = np.zeros(actuators.blind.shape[1]), np.zeros(actuators.controls)
-        # A block of the dynamics contains rows of A, a buffer for the constants, and entries of a generalized force.
-        # Its last part is the matrix that maps these entries to the rows (``None`` for the identity).
+        # Each tuple describes rows of A that the dynamics determine: rows, buffer for constants, entries of a
+        # generalized force, and the matrix that maps these entries to the rows (``None`` for the identity).
         base, joints = slice(actuators.base), slice(actuators.base, nv)
         parts: list[tuple[slice, Array, slice, Array | None]] = [
             (blind, self._free_blind, base, np.ascontiguousarray(actuators.blind.T) if actuators.rotors else None),

@@ -28,7 +28,7 @@ from impact_posture.tsid.tasks.task import Task
 # Largest time step of ramps, in periods of the controller.  Without this bound, a tick after a long pause would end a
 # ramp.
 LONGEST = 10
-# Least nv for which LAPACK factorizes the cost (:class:`WhitenedSolver`).  For smaller robots, this saves no time.
+# Least nv for which LAPACK factorizes the cost (:class:`WhitenedSolver`).  For smaller robots, LAPACK saves no time.
 _LARGE = 20
 # A measured vector is invalid if the sum of its squared entries exceeds this value.  The square root of this value is
 # 1e8 (m, rad/s or N).
@@ -139,7 +139,8 @@ class Controller:
         # Call ``advance`` only for tasks that define it, because most tasks keep no memory.
         self._advancing = [task for task in self._tasks if type(task).advance is not Task.advance]
         self._ready = False
-        # Square of the largest violation of a control limit that the tolerance of the solver allows.
+        # The solver may violate control limits slightly.  ``_excess`` is the square of the largest permitted
+        # violation.
         limits = np.abs([self.actuators.lower, self.actuators.upper])
         self._excess = (_EXCESS * max(1.0, float(np.max(limits, where=np.isfinite(limits), initial=0.0)))) ** 2
 
@@ -147,7 +148,8 @@ class Controller:
         """Start again at ``(q, ν)``: set task targets that are not set yet, and clear ramps and warm starts.
 
         Returns:
-            The first command.  If the first tick fails, it repeats this command with additional damping.
+            The first command.  The first tick repeats this command, with additional damping, if the QP has no valid
+            solution.
 
         Raises:
             PostureError: ``q`` is not a configuration, ``v`` is not a velocity, or an entry is too large.

@@ -133,7 +133,7 @@ class PointKinematics:
         np.multiply(self._mask, v, out=self._masked)
         np.matmul(self._masked, self._dJ_transposed, out=self._world)
         np.matmul(self._shifts, self._worlds, out=self._spatials)
-        # The matrix _FLAT also computes the product ω × v_p.
+        # The matrix of the shifts, ``_FLAT``, also computes ω × v_p.
         np.matmul(self._linear, _FLAT, out=self._turn)
         np.matmul(self._turns, self._twists, out=self._drifts)
         self._drift += self._spatial

@@ -18,7 +18,7 @@ OFF = 1e-6
 # A row that violates a bound by more than this keeps its value while the cost is minimized.  The violation is
 # relative to the norm of the row times the norm of z.
 _MISSES = 1e-9
-# Largest violation of a bound by a result, relative to the same product as ``_MISSES``.
+# Largest violation of a bound by a result, relative to the norm of the row times the norm of z.
 _ROUNDING = 1e-13
 # ``_FAR`` is a bound that DAQP treats as infinite.  ``_SETTINGS`` are the DAQP settings of :func:`_cheapest`.
 _FAR, _SETTINGS = 1e30, SETTINGS | {"primal_tol": 1e-11}
@@ -55,7 +55,7 @@ class Outcome:
 
 
 def solve(assembly: Assembly, solver: DaqpSolver) -> Outcome:
-    """Solve the QP of the assembly, starting from the solver's active set.  If this fails, solve a relaxed QP.
+    """Solve the QP of the assembly, starting from the solver's active set.  If the solver fails, solve a relaxed QP.
 
     Dynamics, control limits and friction always hold, because every state has an acceleration that satisfies them.
     The acceleration bounds of joint limits are exceeded only as far as these hard rows require.  The strict levels
@@ -86,9 +86,9 @@ def solve(assembly: Assembly, solver: DaqpSolver) -> Outcome:
 def _cheapest(qp: QP, units: Array, nearest: Array) -> Solved:
     """Minimize the cost without changing the errors of the lexicographic answer ``nearest``.
 
-    Equations, and rows that violate their bounds, keep their values.  The cost is therefore minimized in the null
-    space of these rows: ``z = nearest + W y``.  In the basis ``W``, the cost is a sum of squares.  All other bounds
-    hold.  Return ``nearest`` if no direction is free or the solver failed.
+    Equations keep their values, and so do rows that violate their bounds.  The cost is therefore minimized in the
+    null space of all these rows: ``z = nearest + W y``.  In the basis ``W``, the cost is a sum of squares.  All other
+    bounds hold.  Return ``nearest`` if the null space is empty or the solver failed.
     """
     values, rows = qp.values(nearest), np.vstack([np.eye(qp.n), qp.A]) * units
     size, lengths = max(1.0, float(np.max(np.abs(nearest / units)))), np.linalg.norm(rows, axis=1)
@@ -103,7 +103,7 @@ def _cheapest(qp: QP, units: Array, nearest: Array) -> Solved:
     curvatures, axes = np.linalg.eigh((free.T * units) @ qp.H @ (units[:, None] * free))
     largest = float(curvatures[-1])
     W = free @ (axes / np.sqrt(np.maximum(curvatures / largest, _FLATTEST)))
-    # Leave out the bounds of rows that change only by rounding errors along the free directions.
+    # Leave out the bounds of rows that change only by rounding errors within the null space.
     sees = np.linalg.norm(rows @ free, axis=1) > _MISSES
     bound = np.flatnonzero(~held & sees & (np.isfinite(lower) | np.isfinite(upper)))
     seen, g = rows[bound] @ W, W.T @ (units * (qp.H @ nearest + qp.g)) / (size * largest)

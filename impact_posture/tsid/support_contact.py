@@ -39,8 +39,8 @@ class SupportContact:
         kd: Damping of the contact, 1/s.
         weight: Weight of the contact's acceleration in the cost; with ``None``, the contact is a hard constraint.
             The rows of several points can be dependent, and their rank can change with the posture.  For example, the
-            12 rows of solo8's feet have rank 9 to 11.  As hard constraints, they would require unbounded
-            accelerations.
+            12 rows of solo8's feet have rank 9 to 11.  If these rows were hard constraints, they would require
+            unbounded accelerations.
     """
 
     point: Point

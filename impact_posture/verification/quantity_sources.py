@@ -75,8 +75,8 @@ class Numbers:
 
     Attributes:
         values: Name of the quantity → value.
-        scales: Name of the quantity → smallest denominator of the relative error.  A larger entry of the quantity
-            replaces this denominator.
+        scales: Name of the quantity → smallest denominator of the relative error.  If the quantity has a larger
+            entry, this entry is the denominator.
     """
 
     values: dict[str, Array]
@@ -180,7 +180,7 @@ class MujocoSource:
         feet = [numeric.jacobian(s.frame, s.offset)[: s.rows] for s in objective.supports]
         M, J, Js = reduced(objective.robot.projector, M, J, np.vstack([np.zeros((0, len(M))), *feet]))
         system = np.block([[M, -Js.T], [Js, objective.compliance * np.eye(len(Js))]])
-        # Entries of followers and locked joints are zero here.
+        # The projector sets the entries of coupled and locked joints to zero.
         A = np.linalg.solve(system, np.vstack([J.T, np.zeros((len(Js), 3))]))[: len(M)]
         weighed = M @ A if metric.kind == "kinetic" else metric.diagonal(len(M))[:, None] * A
         n = normal if contact.normal_frame == "world" else numeric.rotation(contact.frame) @ normal

@@ -39,7 +39,7 @@ NO_COMPILER = f"no C compiler: {GET_ONE}"
 # Largest relative errors that pass.  ``_MODEL`` is for M and J.  ``_VALUES`` is for H, G, Λ_c and analytic gradients.
 # ``_DIFFERENCES`` is for finite differences.
 _MODEL, _VALUES, _DIFFERENCES = 1e-9, 1e-9, 1e-8
-# For standing robots, these errors replace ``_VALUES`` and ``_DIFFERENCES``.  They are larger, because the condition
+# Replacements of ``_VALUES`` and ``_DIFFERENCES`` for standing robots.  The errors are larger, because the condition
 # number of the linear system is about 1/ε, where ε is the compliance of the supports.
 _ON_FEET = 1e-7, 1e-6
 
@@ -121,7 +121,8 @@ def verify(
 
     The error of a quantity is relative to its largest entry.  ``H``, ``G`` and ``∇H`` are zero if the contact cannot
     move along the normal.  Therefore, the denominator of the errors of ``H`` and ``∇H`` is at least a thousandth of
-    the largest entry of ``Λ_c``.  For ``G``, it is at least a thousandth of the largest entry of ``JM⁻¹Jᵀ``.
+    the largest entry of ``Λ_c``.  The denominator of the error of ``G`` is at least a thousandth of the largest entry
+    of ``JM⁻¹Jᵀ``.
 
     Args:
         objective: Objective with the robot, contact, metric and supports.

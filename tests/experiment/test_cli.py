@@ -137,7 +137,7 @@ def test_simulate_a_robot_that_falls(falls: Path, tmp_path: Path) -> None:
     assert done.returncode == 4 and len(done.stderr.splitlines()) == 1
     assert "solo8-push, nominal: fell: the base" in done.stderr and "at t = " in done.stderr
     assert "q_total" not in done.stdout and "peak jump" not in done.stdout
-    assert "limits made a task give way" in done.stdout and "the last one was kept" in done.stdout
+    assert "limits made a task give way" in done.stdout and "the last command was kept" in done.stdout
     assert max(len(line) for line in done.stdout.splitlines()) <= 80
     assert list((tmp_path / "fell").glob("*.png")) and (tmp_path / "fell" / "series.npz").is_file()
     again = start("simulate", str(falls), *"--sign +1 --out fell --format png --force --json".split(), cwd=tmp_path)

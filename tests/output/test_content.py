@@ -391,7 +391,7 @@ def test_shapes_in_collision_have_a_color_and_a_name(talos: ResultView) -> None:
 def test_a_robot_without_shapes_is_drawn_by_its_sticks(pendulum: ResultView) -> None:
     figure = postures_figure(without_shapes(pendulum))
     assert not any(silhouettes(axes) for axes in figure.axes)
-    assert "They do not show the shapes of the links." in text_of(figure)
+    assert "Sticks do not show the shapes of the links." in text_of(figure)
     assert "shapes" not in text_of(figure).split(" | ")
 
 

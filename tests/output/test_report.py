@@ -200,7 +200,7 @@ def test_every_contact_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     ]
     page = rewrite_report(tmp_path / "out").read_text()
     captions = Reader(page).texts["caption"]
-    first = "Before and after, of an impact at FL_FOOT alone; the objective is of all contacts"
+    first = "Before and after, of an impact at FL_FOOT alone; the objective covers all contacts"
     assert {first, "Before and after, of an impact at HR_FOOT alone"} <= {*captions}
     assert "H at FL_FOOT" in page and "impulse at HR_FOOT" in page and "contacts at once" in page
 

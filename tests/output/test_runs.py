@@ -374,7 +374,7 @@ def test_long_curves_are_simplified_and_keep_their_peaks(tmp_path: Path) -> None
 def test_bad_input(flying: RunView, pushed: RunView, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"torque has the shape \(400, 2\).*give \(400, 3\)"):
         dataclasses.replace(flying, torque=flying.torque[:, :2])
-    with pytest.raises(InputError, match="no course of time"):
+    with pytest.raises(InputError, match="fewer than two ticks"):
         dataclasses.replace(flying, t=flying.t[::-1])
     with pytest.raises(InputError, match="there is no run to draw"):
         figures_of_comparison([])

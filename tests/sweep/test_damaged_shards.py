@@ -187,7 +187,7 @@ def test_the_command_names_damaged_files(solved: tuple[Sweep, str, Path], tmp_pa
         "run sweep again to solve these shards again, and move away files that sweep did not write\n"
     )
     again = run("sweep", "sweep.toml", "--out", "out", "--workers", "1", cwd=tmp_path)
-    warning = "warning: data/case=0/shard-000001.parquet was damaged or of another sweep, and was written again\n"
+    warning = "warning: data/case=0/shard-000001.parquet was damaged or belonged to another sweep; it was rewritten\n"
     assert (again.returncode, again.stderr) == (0, warning)
     assert contents(tmp_path / "out") == contents(solved[2])
 

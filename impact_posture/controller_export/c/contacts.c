@@ -1,6 +1,6 @@
 /* Contacts with the ground: desired accelerations, target poses, and friction cones. */
 
-/* Return the row of a contact Jacobian that belongs to an entry of f. */
+/* Return the Jacobian row along which a component of the contact forces acts (index `entry` in the force vector). */
 static const double *ip_contact_motion(const ip_context *c, int entry)
 {
   const int k = ip_force_contact[entry];
@@ -62,7 +62,8 @@ static void ip_hold_contacts(ip_context *c)
       if (!(length < IP_ACROSS)) {
         break;
       }
-      /* A point contact may have any heading.  Use the world axis with the smallest component along the normal. */
+      /* The tangential axes of a point contact are arbitrary.  Start from the world axis with the smallest component
+       * along the normal. */
       j = fabs(n[1]) < fabs(n[0]) ? 1 : 0;
       j = fabs(n[2]) < fabs(n[j]) ? 2 : j;
       for (i = 0; i < 3; ++i) {

@@ -1,4 +1,4 @@
-/* Relaxed answer for a tick whose strict levels are infeasible (relaxation.h). */
+/* Relaxed solution of a tick in which the strict priority levels are infeasible (relaxation.h). */
 
 /* Number of rows of the QP, without the rows that bound joint accelerations. */
 #define IP_OTHERS (IP_GENERAL - (IP_DENSE ? IP_BOUNDED : 0))

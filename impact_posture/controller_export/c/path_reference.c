@@ -139,7 +139,7 @@ static int ip_path_touches(const ip_path *p, const double *v, double force)
   if (force > p->felt) {
     return 1;
   }
-  /* At the beginning of the run-up, the planned speed is too small for a comparison. */
+  /* At the beginning of the run-up, the planned speed is too small to be compared with the measured speed. */
   return v && planned * p->stopped > p->stopped * p->stopped * IP_PATH_SPEED
          && ip_dot(ip_path_approach, v, IP_NV) < p->stopped * planned;
 }

@@ -84,8 +84,9 @@ static int ip_normalize(ip_context *c)
   if (c->scale > 0.0) {
     return 1;
   }
-  /* Compute the directions that all tasks leave free.  If there are none, use the directions that contacts and strict
-   * levels leave free.  If these leave no direction free, use all directions. */
+  /* Compute the directions that all tasks leave free.  If all tasks leave no direction free, use the directions that
+   * contacts and strict levels leave free.  If contacts and strict levels leave no direction free, use all
+   * directions. */
   for (all = 1; all >= 0 && !redundant; --all) {
     double most;
     memset(A, 0, sizeof(double) * N * N);
@@ -108,7 +109,8 @@ static int ip_normalize(ip_context *c)
   for (i = 0; i < N && !redundant; ++i) {
     P[i * (N + 1)] = 1.0;
   }
-  /* Take the differences along the axes.  Along a basis of the redundancy, their error would depend on the basis. */
+  /* Take finite differences along the coordinate axes of v.  Differences along a basis of the redundancy would have
+   * errors that depend on the basis. */
   for (k = 0; k < N; ++k) {
     double z[N] = {0};
     z[k] = 1.0;
@@ -197,7 +199,7 @@ static void ip_advance(ip_context *c, double dt)
 #endif
 }
 
-/* Write the desired accelerations of the posture task.  Without a posture task, they stay zero. */
+/* Write the desired accelerations of the posture task; zero without a posture task. */
 static void ip_posture_wanted(ip_context *c)
 {
 #if IP_POSTURE

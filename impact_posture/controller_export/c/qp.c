@@ -1,23 +1,24 @@
 /* The QP of a tick in the form of DAQP: minimize |u|^2 subject to lower <= M u <= upper; each row has the length one.
  *
- * The variables z = [v; w; f] are z = T (center + u), where T makes the cost |T^-1 z|^2/2:
+ * The variables are z = [v; w; f] (accelerations, spare thrusts, contact forces) and z = T (center + u), where T
+ * makes the cost |T^-1 z|^2/2:
  * - IP_DENSE: T is the inverse of a Cholesky factor.  The bounds on joints are the last rows.
  * - IP_MOMENTUM: the cost is diagonal in the accelerations of the joints, the center of mass in the world (in place of the
  *   linear acceleration of the base), and the angular acceleration of the base.
  * - Otherwise T is diagonal.
- * In the last two cases, joints come first in u, and their bounds are bounds on u. */
+ * Except with IP_DENSE, joints come first in u, and their bounds are bounds on u. */
 
 /* Rows with a smaller length are treated as zero, as in DAQP. */
 #define IP_NOTHING 1e-11
 #define IP_JOINTS_V (IP_NV - IP_BASE)
 
-/* Return the index in v for an index in u. */
+/* Return the index in v (accelerations) of entry k of u. */
 static int ip_entry(int k)
 {
   return IP_DENSE ? k : k < IP_JOINTS_V ? k + IP_BASE : k - IP_JOINTS_V;
 }
 
-/* out = row T for a row on the accelerations v. */
+/* out = row T, where `row` multiplies the accelerations v. */
 static void ip_whiten(const ip_context *c, const double *row, double *restrict out)
 {
   int i, j;

@@ -46,7 +46,7 @@ static void ip_measure_rank(ip_context *c)
     }
     trace += G[i * (N + 1)];
   }
-  /* Squares of a lower and an upper bound on the least singular value. */
+  /* Squares of a lower and an upper bound on the least singular value of all rows. */
   low = least * least;
   high = trace / N;
   for (k = 0; k < 7; ++k) {

@@ -61,7 +61,7 @@ static void ip_flow_reduce(const ip_flow *f, double (*J)[IP_NV], double *slope)
   }
 }
 
-/* Evaluate objective and constraints at the predicted q_r of the next change of the motion. */
+/* Evaluate objective and constraints at q_r as predicted for the next change of acceleration. */
 static void ip_flow_look(ip_context *c)
 {
   ip_flow *f = &c->flow;
@@ -132,8 +132,8 @@ static void ip_flow_aim(ip_flow *f)
   }
 }
 
-/* Evaluate the gradient near the last evaluated posture.  In every second update, evaluate it at the point where the
- * flow would stop. */
+/* Evaluate the gradient near the last evaluated posture.  In every second update, evaluate the gradient at the
+ * posture where the flow would stop. */
 static void ip_flow_probe(ip_context *c)
 {
   ip_flow *f = &c->flow;

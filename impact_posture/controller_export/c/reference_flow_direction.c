@@ -151,7 +151,8 @@ static void ip_flow_learn(ip_flow *f, const double *slope, const double *shares)
   }
 }
 
-/* Remove from a change of the flow the part that increases H, here or after the displacement `stop` of braking. */
+/* Remove from a change of the flow velocity the part that increases H, at the present q_r or after the displacement
+ * `stop` of braking. */
 static void ip_flow_downhill(const ip_flow *f, const double *stop, double *step)
 {
   double uphill[IP_NV], climb;
@@ -168,8 +169,8 @@ static void ip_flow_downhill(const ip_flow *f, const double *stop, double *step)
   }
 }
 
-/* Return the time in which a constant deceleration stops the flow.  Without deceleration, the flow would cover twice
- * the braking distance in this time. */
+/* Return the time in which a constant deceleration stops the flow.  The braking distance is half the present speed
+ * times this time. */
 static double ip_flow_stopping(const ip_flow *f, const ip_params *p)
 {
   return ip_largest(f->flow, 0) / p->flow_acceleration[0];

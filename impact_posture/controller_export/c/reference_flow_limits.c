@@ -89,7 +89,7 @@ static void ip_flow_limits(ip_context *c)
   }
 }
 
-/* Compute the displacement within a time after the change `step` of the velocity of the flow. */
+/* Compute the displacement within `time` seconds if the velocity of the flow changes by `step`. */
 static void ip_flow_after(const ip_flow *f, const double *step, double time, double *moved)
 {
   int i;

@@ -9,7 +9,7 @@ static void ip_shorten(double *x, double most)
   }
 }
 
-/* Compute the velocity with the slowest joints that changes the constraints at a rate.  Call ip_flow_still first. */
+/* Compute the velocity that changes the constraints at `rate` and moves the joints least.  Call ip_flow_still first. */
 static void ip_flow_moving(const ip_flow *f, const double *rate, double *back)
 {
   int i;
@@ -57,8 +57,8 @@ static void ip_flow_back(ip_context *c, double period, double *back)
   ip_add(back, 1.0, f->returning, IP_NV);
 }
 
-/* Return the time in which the new velocity covers the distance of the change and of the braking, at the deceleration
- * that the actuators permitted in the last changes. */
+/* Return the time in which the velocity after `step` covers the distance of this change and of the braking after it.
+ * The deceleration is the deceleration that the actuators permitted in the last changes. */
 static double ip_flow_braking(const ip_flow *f, const ip_params *p, const double *step, double period)
 {
   double after[IP_NV];
@@ -94,8 +94,8 @@ static void ip_flow_bound_speed(const ip_flow *f, const ip_params *p, double *st
   }
 }
 
-/* Compute the change of the flow towards the wanted step, as in FlowGovernor.change.  Return whether the flow only
- * brakes. */
+/* Compute the change of the flow towards the wanted step, as in FlowGovernor.change.  Return whether the change only
+ * slows the flow down. */
 static int ip_flow_change(const ip_flow *f, const ip_params *p, double period, double fastest, double *step)
 {
   enum { N = IP_NV, FAST = 0, BRAKE = 2 };
@@ -160,8 +160,8 @@ static void ip_flow_govern(ip_context *c)
   if (f->on && !f->resting && f->visited == IP_PATH) {
     f->moved += period;
   }
-  /* The flow keeps its speed until the next change.  After that change, 2/5 of the largest acceleration must suffice to
-   * stop the flow in the remaining time. */
+  /* The flow keeps its speed until the next change.  From the next change on, 2/5 of the largest acceleration must
+   * suffice to stop the flow in the remaining time. */
   f->remains = fmin(f->deadline - f->clock, p->flow_duration[0] - f->moved) - 2.0 * period;
   fastest = fmin(fastest, 0.4 * p->flow_acceleration[0] * fmax(f->remains, 0.0));
   fastest = f->on ? fastest : 0.0;
@@ -177,7 +177,7 @@ static void ip_flow_govern(ip_context *c)
   for (i = 0; i < N; ++i) {
     more[i] = step[i] / period;
   }
-  /* Braking before a limit may use more of the actuators' remaining range. */
+  /* Braking may use a larger fraction of the remaining range of the actuators than acceleration. */
   part = ip_flow_permitted(c, known, more, brakes ? (1.0 + p->flow_haste[0]) / 2.0 : p->flow_haste[0]);
   f->able = fmin(fmax(part, IP_ABLE), f->able + IP_ABLE);
   ip_add(f->flow, part, step, N);
@@ -315,7 +315,8 @@ static void ip_flow_lead(ip_context *c, double dt)
       continue;
     }
     if (ip_flow_led[k] == 1) {
-      /* Compute the model only for the first of these tasks, because the others read the same model. */
+      /* Compute the model only for the first task that follows the flow, because all other such tasks read the same
+       * model. */
       ip_dynamics(f->q, f->velocity, &c->ahead);
     }
     ip_lead_target(target, k, &c->ahead, f->q, f->velocity, f->acceleration);

@@ -37,7 +37,7 @@ static void ip_flow_decompose(ip_context *c)
   f->most = ip_eigen(G, G + M * M, M);
 }
 
-/* Compute the pseudo-inverse of J on the constrained directions, and an orthonormal basis of the free directions in
+/* Compute the pseudo-inverse of J on the constrained directions, and an orthonormal basis of the null space of J in
  * the rows of Z, from the eigenvectors of JJ'. */
 static void ip_flow_space(ip_flow *f)
 {
@@ -120,8 +120,8 @@ static void ip_flow_project(const ip_flow *f, double *x)
   memcpy(x, out, sizeof out);
 }
 
-/* Compute the contact forces with the least weighted norm that carry a wrench on the base.  Write J' times these
- * forces, per unit of each entry of the wrench. */
+/* Compute the contact forces with the least weighted norm that carry a wrench on the base.  Write the generalized
+ * force J' f that these forces f cause, for a unit of each entry of the wrench. */
 static void ip_flow_carry(ip_flow *f)
 {
 #if IP_CONTACTS
@@ -231,7 +231,7 @@ static void ip_flow_polygon(ip_context *c)
     const int sole = ip_contact_row[i / 4 + 1] - ip_contact_row[i / 4] == 6;
     for (j = 0; j < 2; ++j) {
       x[i][j] = c->m.position[ip_contact_point[i / 4]][j];
-      /* Point contacts have no corners, and the model has no rotation of their frames. */
+      /* A point contact has no corners, and the model does not compute the rotation of its frame. */
       x[i][j] += sole ? (i & 1 ? 1.0 : -1.0) * half[0] * R[3 * j] + (i & 2 ? 1.0 : -1.0) * half[1] * R[3 * j + 1] : 0.0;
     }
     ip_add(mean[i % 4], 1.0 / IP_CONTACTS, x[i], 2);
@@ -241,7 +241,8 @@ static void ip_flow_polygon(ip_context *c)
     for (j = 0; j < 2; ++j) {
       x[i][j] += even * (mean[i % 4][j] - x[i][j]);
     }
-    /* Start at the leftmost corner.  If several are leftmost, start at the lowest, which is the end of an edge. */
+    /* Start at the leftmost corner.  If several corners are leftmost, start at the lowest leftmost corner, which is
+     * the end of an edge. */
     start = x[i][0] < x[start][0] - IP_ON_LINE || (x[i][0] <= x[start][0] + IP_ON_LINE && x[i][1] < x[start][1]) ? i
                                                                                                                 : start;
   }

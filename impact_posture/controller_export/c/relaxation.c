@@ -1,4 +1,4 @@
-/* Start at z = 0 with the bounds of the problem.  The coordinates are the scaled variables. */
+/* Start at z = 0 with the bounds of the problem.  A coordinate is a variable divided by its typical size. */
 static void begin(Relaxation *r, const relaxation_problem *p, char *work, int budget) {
     const int n = p->n;
     memset(r, 0, sizeof *r);

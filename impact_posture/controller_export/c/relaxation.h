@@ -1,4 +1,5 @@
-/* Lexicographic answer to a tick whose strict levels are infeasible, as in impact_posture/tsid/relaxation.py.
+/* Lexicographic solution of a tick in which the strict priority levels are infeasible, as in
+ * impact_posture/tsid/relaxation.py.
  *
  *     min 1/2 z'Hz + g'z   subject to   lower <= [z; A z] <= upper
  *
@@ -51,8 +52,8 @@ typedef struct {
 size_t relaxation_bytes(int n, int m, int levels);
 
 /* Solve the problem, and return one of the codes above.  Write z (n numbers) if the code is positive.  `budget` is
- * the largest total number of iterations.  If the budget does not suffice, the next call continues from the
- * active rows. */
+ * the largest total number of iterations.  If `budget` does not suffice, the next call continues from the active
+ * rows. */
 int relaxation_solve(const relaxation_problem *problem, void *work, int budget, double *z, relaxation_report *report);
 
 #ifdef __cplusplus

@@ -127,7 +127,7 @@ static int find_step(Relaxation *r) {
     return rank + used;
 }
 
-/* Mark the exact and close rows as held or free. */
+/* Set the flag `held` of all exact and close rows. */
 static void hold_rows(Relaxation *r, int held) {
     for (int i = 0; i < r->exact; i++) r->held[r->rows[i]] = held;
     for (int i = 0; i < r->near; i++) r->held[r->close[i]] = held;

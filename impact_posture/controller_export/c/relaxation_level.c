@@ -37,7 +37,7 @@ static void list_rows(Relaxation *r, int level, const double *L) {
 }
 
 /* Set the bounds of the program relative to the present point or, with `wanted`, to the minimum of the cost.  Divide
- * the bounds by their size, and return this size. */
+ * the bounds by the largest violation, at least EXACT, and return the divisor. */
 static double set_bounds(Relaxation *r, const double *wanted) {
     const int free = r->n - r->fixed;
     double largest = 0, size = 1;
@@ -118,8 +118,8 @@ static int drop_rows(Relaxation *r) {
         r->rhs[i] *= r->goal[row] == r->upper[row] ? 1 : -1;
         if (r->rhs[i] < r->rhs[worst]) worst = i;
     }
-    /* If the last move brought no progress, remove only the exact row with the worst multiplier.  Removing more rows
-     * could stop the next move at once, where many bounds meet. */
+    /* If the last move brought no progress, remove only the exact row with the worst multiplier.  If more rows were
+     * removed where many bounds meet, the next move could have length zero. */
     const int all = square < (1 - PROGRESS) * r->square;
     for (int i = 0; i < exact; i++)
         if (most > 0 && (r->rhs[i] > COUNTS * most || (!all && i != worst))) r->rows[exacts++] = r->rows[i];
@@ -174,7 +174,8 @@ static int finish_level(Relaxation *r, int level, int missed) {
     return find_step(r);
 }
 
-/* Minimize the error of a level without changing the errors of earlier levels.  Later levels keep this error. */
+/* Minimize the error of a level without changing the errors of earlier levels.  Later levels do not change the error
+ * that this function reaches. */
 static int solve_level(Relaxation *r, int level) {
     int missed = 0, same = 0;
     list_rows(r, level, NULL);

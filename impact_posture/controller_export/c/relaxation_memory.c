@@ -12,8 +12,8 @@
 #define MOST_STEPS 4
 #define MOST_MOVES 60
 #define MOVE_COST 0.1
-/* DAQP may violate bounds by EXACT.  Violations up to COUNTS are treated as zero.  Both are relative to the norm of
- * the row times the norm of z. */
+/* DAQP may violate bounds by EXACT.  Violations up to COUNTS are treated as zero.  EXACT and COUNTS are relative to
+ * the norm of the row times the norm of z. */
 #define EXACT 1e-9
 #define COUNTS 1e-7
 /* Least relative decrease of a sum of squares. */
@@ -22,8 +22,8 @@
 #define WRONG 1e-7
 /* Largest violation of a bound in the program of the cost, relative to its unit. */
 #define ROUNDING 1e-10
-/* A row is constant if its remaining length is below FLAT.  PIVOT is the least pivot of an elimination.  Both are
- * relative to the length of the whole row. */
+/* A row is constant if its remaining length is below FLAT.  PIVOT is the least pivot of an elimination.  FLAT and
+ * PIVOT are relative to the length of the whole row. */
 #define FLAT 1e-12
 #define PIVOT 1e-8
 /* Proximal terms relative to the largest diagonal entry of the Hessian, in the order of the attempts. */
@@ -34,12 +34,12 @@ typedef struct {
     int n, entries, fixed, left; /* number of variables, entries of [z; A z], eliminated coordinates, iterations left */
     double *Z, *T;               /* Z, n x n: z can move along the columns from `fixed` on; T = A Z for known rows */
     double *z, *value, *lower, *upper, *length; /* present z, [z; A z], widened bounds, lengths of rows in `unit` */
-    int *first, *last, *known;   /* range of a row's nonzero entries; `fixed` at the last computation of its motion */
+    int *first, *last, *known;   /* first, last nonzero entry of a row; value of `fixed` when T was computed */
     int *held;                   /* whether each entry is eliminated */
     double *goal;                /* desired values of exact and close rows */
     double *B, *v, *tau, *rhs, *step, *column; /* work arrays of an elimination */
     double *motion_z;            /* change of z by a step, Z times the step */
-    int *rows, *lead, *close;    /* exact rows; exact row of the k-th reflection; close rows (least squares) */
+    int *rows, *lead, *close;    /* exact rows; exact row that reflection k maps; close rows (least squares) */
     int exact, near, rank;       /* number of exact rows, of close rows, and of coordinates that the exact rows use */
     double *L, *wanted;          /* factor of the Hessian (1/L on the diagonal); minimum of the cost, whitened */
     DAQPWorkspace daqp;
@@ -51,7 +51,7 @@ typedef struct {
     double tolerance, scale;     /* violation that DAQP may leave; largest entry of z, in `unit` */
 } Relaxation;
 
-/* Return an array after the earlier arrays in the workspace; if base is null, only count its bytes. */
+/* Reserve an array behind the earlier arrays in the workspace; if base is null, only count its bytes. */
 static void *take(char *base, size_t *used, size_t count, size_t size) {
     char *array = base ? base + *used : NULL;
     *used += (count * size + sizeof(double) - 1) / sizeof(double) * sizeof(double);

@@ -106,7 +106,8 @@ static void ip_present(const ip_model *m, const double *q, int k, ip_target *tar
   target->set = 1.0;
 }
 
-/* Compute log6 of the motion to a pose, in world axes.  At the call, e begins with the difference of the origins. */
+/* Compute log6 of the motion to a pose, in world axes.  On input, e[0..2] is the desired origin minus the present
+ * origin. */
 static void ip_pose_error(const double *R, const double *wanted, double *e)
 {
   double relative[9], w[3], p[3], linear[3];

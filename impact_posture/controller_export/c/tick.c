@@ -161,7 +161,7 @@ int ip_reset(ip_context *c, const double q[IP_NQ], const double v[IP_NV], ip_com
   for (i = 0; i < IP_NV; ++i) {
     c->damping[i] = 10.0 * c->m.M[i * (IP_NV + 1)];
   }
-  /* If the first tick fails, it repeats this command, which balances gravity. */
+  /* This command balances gravity.  The first tick repeats it if the QP has no valid solution. */
   for (i = 0; i < IP_CONTROLS; ++i) {
     const double *h = c->m.h;
     const double force = i < IP_ROTORS ? ip_dot(ip_inverse + i * IP_BASE, h, IP_BASE) : h[IP_BASE + i - IP_ROTORS];

@@ -51,7 +51,7 @@ def bars_figure(rows: Sequence[Bar]) -> Figure:
     lines = [groups[k : k + columns] for k in range(0, len(groups), columns)]
     heights = [0.55 + 0.3 * max(len(group) for group in line) for line in lines]
     lead = "Motion during impacts, ∫‖ν‖dt over the impact windows"
-    facts = ["less is better", "the same windows for every controller", "bars: ours, mean and 95 % interval"]
+    facts = ["less is better", "the same windows for every controller", "bars: this package, mean and 95 % interval"]
     with framed(lead, [SEPARATOR.join(facts)], sum(heights) + 0.4, NOTES) as (figure, body):
         panels = body.subplots(len(lines), columns, squeeze=False, height_ratios=heights)
         for axes in panels.flat[len(groups) :]:
@@ -65,8 +65,8 @@ def bars_figure(rows: Sequence[Bar]) -> Figure:
 def _panel(axes: Any, name: str, group: Sequence[Bar], room: int) -> None:
     ours = max((row.mean + row.half_width for row in group if np.isfinite(row.mean)), default=0.0)
     papers = [row.paper for row in group if row.paper is not None]
-    # The paper used another robot, so the values of the paper can be much larger.  An axis for all of them would make
-    # the bars short.
+    # The paper used another robot, so its values can be much larger.  An axis up to the largest value would make the
+    # bars short.
     near = [paper for paper in papers if paper <= _FAR * ours or ours == 0]
     end = 1.08 * (max([ours, *near]) or 1.0)
     for place, row in enumerate(group):

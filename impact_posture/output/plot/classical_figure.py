@@ -17,11 +17,10 @@ from impact_posture.output.plot.style import BLUE, GREEN, INK, VERMILLION, frame
 from impact_posture.system.arrays import Array
 
 NOTES = (
-    "Each kind of ellipsoid is divided by its longest finite semi-axis before, which the legend states. "
-    "Velocity J Jᵀ: contact velocities of joint velocities of norm 1. Force (J Jᵀ)⁻¹: contact forces of joint "
-    "torques of norm 1 (unbounded where J is singular). Neither depends on inertia or supports; impact "
-    "Λ$_c$ = J M⁻¹ W M⁻¹ Jᵀ does. A direction of large velocity has small force. The jump of an impact "
-    "need not follow either.",
+    "Velocity, force and impact ellipsoids are divided by their own longest finite semi-axis in the initial posture "
+    "(legend). Velocity J Jᵀ: contact velocities of joint velocities of norm 1. Force (J Jᵀ)⁻¹: contact forces of "
+    "joint torques of norm 1 (unbounded where J is singular). Only impact, Λ$_c$ = J M⁻¹ W M⁻¹ Jᵀ, depends on "
+    "inertia and supports. A direction with a large velocity has a small force, but an impact may follow neither.",
 )
 _LOOKS: dict[str, dict[str, Any]] = {
     "velocity": {"color": GREEN, "linestyle": (0, (5, 2)), "linewidth": 1.4, "zorder": 3.4},

@@ -44,7 +44,7 @@ from impact_posture.output.plot.style import (
 )
 from impact_posture.system.arrays import Array
 
-# Length of arrows as a share of the limit of the panel.  The drawn cone has the same length.
+# Length of arrows and of the drawn cone, as a share of the limit of the panel.
 REACH = 0.92
 _FREE = "Free (thin): the same robot with feet that are not held."
 _CONE = "The objective is the value for the worst normal of the cone. All equally bad normals are drawn."
@@ -69,9 +69,9 @@ def ellipsoid_figure(view: ResultView) -> Figure:
     """Draw Λ_c at the start (dashed) and at the optimum (solid), projected onto planes and in 3-D, with √H along n.
 
     The planes are the coordinate planes.  If none of them contains n, the upright plane through n is added.
-    Projections onto planes that contain n have tangent lines at ±√H.  All axes are equal and share one scale.  Thin
-    lines show the ellipsoids without support feet.  For an uncertain normal, the figure shows the cone of normals
-    and the worst normals.
+    Projections onto planes that contain n have tangent lines at ±√H.  All panels have the same scale, equal in all
+    directions.  Thin lines show the ellipsoids without support feet.  For an uncertain normal, the figure shows the
+    cone of normals and the worst normals.
     """
     states = [_State("before", view.before, BEFORE), _State("after", view.after, AFTER)]
     for word, free, line in zip(("before", "after"), view.free, (FREE_BEFORE, FREE_AFTER), strict=False):

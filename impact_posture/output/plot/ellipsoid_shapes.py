@@ -75,7 +75,7 @@ def longest(matrix: Array) -> float:
 
 
 def shadow(matrix: Array, axes: Array, points: int = 181) -> Array:
-    """Return the edge of the projection of ``{x: xᵀΛ⁻¹x ≤ 1}`` onto the plane of ``axes``, shape (2, points).
+    """Return the outline of the projection of ``{x: xᵀΛ⁻¹x ≤ 1}`` onto the plane of ``axes``, shape (2, points).
 
     The projection is the ellipse of ``P Λ Pᵀ``, where the rows of ``P = axes`` are orthonormal.  A degenerate ellipse
     is a segment or a point.
@@ -122,9 +122,8 @@ def _ring(axes: Array, points: int) -> Array:
 def polar(matrix: Array, infinite: float) -> tuple[Array, Array]:
     """Return the matrix ``A⁻¹`` of the ellipsoid ``{f: fᵀAf ≤ 1}``, and its unbounded directions.
 
-    ``A`` is positive semidefinite, shape (3, 3).  The ellipsoid is the polar dual of ``{x: xᵀA⁻¹x ≤ 1}``.  It is
-    unbounded in the null space of ``A``.  In these directions, the returned ellipsoid has the half-length
-    ``infinite``.  The unbounded directions are columns, shape (3, k).
+    ``A`` is ``matrix``, positive semidefinite, shape (3, 3).  The ellipsoid is unbounded in the null space of ``A``.
+    ``A⁻¹`` gives it the half-length ``infinite`` there.  The unbounded directions are columns, shape (3, k).
     """
     values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
     bounded = values > 1e-10 * max(float(values[-1]), 1e-300)

@@ -1,6 +1,6 @@
 """Figure ``jump``: the velocity jump Δν of each joint at the start and at the optimum.
 
-The jumps are per impulse and at the approach speed.
+One panel shows the jump per unit impulse, the other panel the jump at the approach speed.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ def _notes(view: ResultView, rubbed: Sequence[CoulombJump | None]) -> list[str]:
         notes += f" The contact cannot move along n {' and '.join(still)} (G = 0): no jump for an approach."
     named = [(word, jump) for word, jump in zip(("before", "after"), rubbed, strict=True) if jump is not None]
     if not named:
-        return [notes + " With friction the jump is undefined here."]
+        return [notes + " With friction, the jump is undefined in both postures."]
     fates = " and ".join(f"{'sticks' if jump.sticks else 'slips'} {word}" for word, jump in named)
     return [notes + f" Diamonds: with friction {named[0][1].friction:g} the contact point {fates}."]
 

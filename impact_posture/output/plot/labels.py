@@ -17,9 +17,10 @@ from impact_posture.system.arrays import Array
 _GAPS = (2.0, 5.0, 9.0, 14.0, 20.0, 27.0, 36.0)
 # Directions from the position to the letter that are tried, rad.
 _ANGLES = np.linspace(0.0, 2 * np.pi, 24, endpoint=False)
-# Smallest distance of a letter from lines, points.
+# Smallest distance of a letter from drawn lines, points (1/72 inch).
 _CLEAR = 1.4
-# Pixels darker than this, 0 (black) to 255, count as lines.  The limit includes thin gray lines, but not grids.
+# Pixels darker than this, 0 (black) to 255, count as lines.  With this limit, thin gray lines count, and grids do
+# not.
 _INK = 205
 
 
@@ -58,7 +59,7 @@ def draw_end_on(axes: Any, name: str, plane: Plane, n: Array, at: Array, color: 
 
 
 def draw_with_labels(canvas: FigureCanvasAgg) -> None:
-    """Draw the figure of a canvas after its layout, with its letters where they cover no lines."""
+    """Draw the figure of a canvas after its layout, with each :class:`Label` where it covers no lines."""
     labels = [(axes, text) for axes in canvas.figure.axes for text in axes.texts if isinstance(text, Label)]
     for _, label in labels:
         label.set_visible(False)

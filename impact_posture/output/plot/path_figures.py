@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 NOTES = {
     "distance": "Each point is the best posture found within this distance from the initial posture (joint angles, "
     "sliding joints and base in one norm)",
-    "force": "Each point is the best posture found with at most this peak force of the impact",
+    "force": "Each point is the best posture found whose impact has at most this peak force",
 }
 _LINES = "; lines between points only join them. Hollow: not certified as an optimum."
 _KNEE = (
@@ -188,7 +188,7 @@ def _objective(axes: Any, data: TradeOffData, view: ResultView) -> None:
 
 
 def _title(data: TradeOffData) -> str:
-    """Return the title: the reduction at the knee, or else at half of the distance or of the extra force."""
+    """Return the title: the gain at the knee or, without a knee, at half of the distance or extra force."""
     y, x = data.objective, data.within - data.within[0]
     gain = float(y[0] - y[-1])
     if not gain > 0:
@@ -213,7 +213,7 @@ _SHARES: dict[str, dict[str, Any]] = {
 _MOVED = {"v": "base along ", "w": "base about "}
 _LEAST = "If torques, thrusts and foot forces are not unique, their largest share of a limit is minimized."
 _NOTES = {
-    "scaled": f"One time scale for the whole motion: its fastest instant just meets a limit. {_LEAST}",
+    "scaled": f"The whole motion has one time scale, so it meets a limit only at its fastest instant. {_LEAST}",
     "slowed": f"The speed at each place is as high as the limits allow, and low at corners. {_LEAST}",
     "time-optimal": "Time-optimal: a limit is met all the time, up to 1 %; the curves join the points of the motion.",
 }

@@ -31,7 +31,7 @@ from impact_posture.output.plot.style import AFTER, BEFORE, BLUE, GRAY, INK, VER
 from impact_posture.system.arrays import Array
 
 STICKS = "Sticks join joint origins."
-_NO_SHAPES = "They do not show the shapes of the links."
+_NO_SHAPES = "Sticks do not show the shapes of the links."
 _ENDS = "The last stick of a chain ends at the last frame of its link, or at the center of mass of the link."
 _NORMAL = "n points out of the surface, towards the robot."
 _PUSHED = "n is the direction of the impulse on the robot, which strikes no surface."

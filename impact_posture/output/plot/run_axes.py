@@ -62,8 +62,9 @@ def time_figure(
     """Draw rows of cells with a header above and the legend beside them.  A cell that is ``None`` stays empty.
 
     Cells with the same panel share the limits of their vertical axes.  If cells of a column have the same time axis,
-    only the lowest cell has a label.  ``height`` of a row and additional ``air`` are in inches.  ``widths`` are
-    ratios of the columns.  ``notes`` are sentences below the figure.  ``title_at`` is ``center`` or ``left``.
+    only the lowest cell has a label.  ``height`` of a row and additional ``air`` are in inches.  ``widths`` are the
+    relative widths of the columns.  ``notes`` are sentences below the figure.  ``title_at`` is ``center`` or
+    ``left``.
     """
     columns = len(cells[0])
     shown: dict[Panel, list[Any]] = {}

@@ -26,9 +26,9 @@ from impact_posture.system.escape import plot_label
 
 HINT = "Less H is better: it is the squared velocity jump of an impulse of 1 N·s along n."
 LEFT = "Left: the whole run. Right: the first impact."
-# Number of controllers in a row.
+# Largest number of controllers side by side.
 COLUMNS = 3
-# Ratios of the widths: whole run, first impact.
+# Relative widths of two columns: the whole run, and the first impact.
 _WIDTHS = (1.7, 1.0)
 
 
@@ -89,7 +89,8 @@ def joints_figure(views: Sequence[RunView]) -> Figure:
 def comparison_figure(views: Sequence[RunView]) -> Figure:
     """Draw H of all controllers over time, and below it ``‖ν‖`` around the first impact.
 
-    In the lower panel, time zero is the first impact of each run.  For pushes, this also applies to the upper panel.
+    In the lower panel, time zero is the first impact of each run.  For pushes, the upper panel has the same time
+    axis.
     """
     views = check_same(views, "figure comparison-metric")
     spans = [_since_impact(view) for view in views]
@@ -105,7 +106,7 @@ def comparison_figure(views: Sequence[RunView]) -> Figure:
         longest = max(clips.items(), key=lambda item: item[1].end - item[1].begin)
         cells.append([Cell(speed_panel(views), clips, longest)])
         if not views[0].pushed:
-            notes.append(f"Above, windows of {names[0]} are shaded. Below, time counts from the touch of each run.")
+            notes.append(f"Shaded above: windows of {names[0]}. Time zero below: the first touch of each run.")
     return time_figure(views, cells, 2.3 if len(cells) > 1 else 2.6, notes, air=0.0)
 
 
@@ -136,7 +137,7 @@ def _notes(panels: Sequence[Panel], cells: Sequence[Sequence[Cell | None]]) -> l
 
 
 def _since_impact(view: RunView) -> Clip:
-    """Return the clip of a whole run.  Time zero is the push, because the time before the push differs by run."""
+    """Return the clip of a whole run.  Time zero is the push, because runs differ in the time before the push."""
     clip = whole(view)
     if not (view.pushed and view.impacts):
         return clip

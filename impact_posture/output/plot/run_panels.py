@@ -29,7 +29,7 @@ LINES: tuple[dict[str, Any], ...] = (
 # Line styles for the runs in a panel.  The first run has the style of "before" in other figures, the second run has
 # the style of "after".
 RUNS: tuple[dict[str, Any], ...] = (LINES[1] | {"zorder": 3.5}, LINES[0] | {"linewidth": 1.6}, *LINES[2:])
-# A limit above this multiple of the largest value is not drawn.  A note below the figure states it.
+# A limit above this multiple of the largest value is not drawn, but a note below the figure states this limit.
 _FAR = 4.0
 # A command is at a limit if its distance from the limit is at most this share of the range.
 _NEAR = 1e-3
@@ -90,7 +90,7 @@ class Panel:
         ranges: For each run, lower and upper bound of a shaded band, shape (n, 2).
         stopped: For each run, whether the joint of a curve was at its stop, shape (n, curves).
         note: Sentence below the figure.
-        noisy: Whether the curves contain noise, like the commands of flying robots.
+        noisy: Whether the curves contain noise, as the commands of flying robots do.
         scale: Scale of the vertical axis: ``auto``, ``from zero``, or ``metric`` (logarithmic if H varies strongly).
         overlay: Whether all runs are drawn in the same panel, with different line styles.
     """
@@ -171,7 +171,7 @@ def control_panels(views: Sequence[RunView]) -> list[Panel]:
 def torque_panel(views: Sequence[RunView]) -> Panel | None:
     """Return a panel with commanded joint torques; ``None`` for a robot without joints.
 
-    If there are many joints, it shows the joints that come closest to their limits.  If the shown joints have
+    If there are many joints, the panel shows the joints that come closest to their limits.  If the shown joints have
     different limits, each torque is divided by the limit of its joint.
     """
     first, limits = views[0], views[0].torque_limits
@@ -200,7 +200,7 @@ def torque_panel(views: Sequence[RunView]) -> Panel | None:
     peak = max(float(np.abs(value).max()) for value in values)
     if lines and limit > _FAR * peak:
         named = f"The torque limits (±{number(limit)} {unit}) lie outside of the panels."
-        notes.append(named if unit else f"All stay within {number(100 * peak)} % of it.")
+        notes.append(named if unit else f"All torques stay within {number(100 * peak)} % of their limits.")
         lines = ()
     names = [first.joint_names[k] for k in shown]
     return Panel(label, names, values, lines, note=" ".join(notes), noisy=first.rotor_limits is not None)

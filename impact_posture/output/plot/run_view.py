@@ -85,7 +85,7 @@ class RunView:
                 actual = np.shape(getattr(self, name))
                 raise InputError(f"{name} has the shape {actual}", where=where, hint=f"give {shape}")
         if len(rotors) != 1 or n < 2 or not (np.diff(self.t) > 0).all():
-            fault = "has no course of time"
+            fault = "has fewer than two ticks, or times that do not increase"
             raise InputError(fault, where=where, hint="give at least two ticks at increasing times")
 
     @property

@@ -37,7 +37,7 @@ class PlacedHull:
 
 
 class _Silhouette(PathPatch):
-    """Patch in picture coordinates.  3-D axes draw it behind everything else."""
+    """Patch with two-dimensional coordinates that 3-D axes draw behind everything else."""
 
     def do_3d_projection(self) -> float:
         """Return an infinite depth: 3-D axes draw the deepest patch first, so all other patches cover this patch."""

@@ -84,9 +84,9 @@ def build_skeleton(
 ) -> Skeleton:
     """Return the sticks at ``q``, shape (nq,).
 
-    A stick joins the origins of a joint and its parent.  A base with at least four joints is a box.  Further sticks
-    lead to contact points and feet.  In other chains, the last stick leads to :func:`link_tip`.  ``collisions`` are
-    pairs of names of colliding shapes.
+    A stick joins the origins of a joint and its parent.  A base with at least four joints is drawn as a box.  Further
+    sticks lead to contact points and feet.  A chain without contact point or foot ends with a stick to
+    :func:`link_tip`.  ``collisions`` are pairs of names of colliding shapes.
     """
     model = robot.model
     data = model.createData()

@@ -98,7 +98,7 @@ def snapshots_figure(views: Sequence[RunView]) -> Figure:
 
 
 def _window(low: Array, high: Array, view: RunView, plane: Plane) -> tuple[Array, Array]:
-    """Return the corners of a panel that shows all sticks, and the surface unless it faces the reader."""
+    """Return the corners of a panel that shows all sticks and, unless the surface faces the reader, the surface."""
     if view.surface is not None:
         touched = plane.axes @ view.surface
         n = plane.axes @ np.array(view.contact.normal)

@@ -31,7 +31,7 @@ VERMILLION, BLUE, GREEN, SKY, PURPLE, ORANGE = "#D55E00", "#0072B2", "#009E73", 
 INK, GRAY, PALE = "#000000", "#6b6b6b", "#d9d9d9"
 
 # Lines for "before" and "after" also differ in line style and hatch, so they are distinguishable in a gray print.
-# The dashed line is on top.  If both lines coincide, the solid line is visible in the gaps.
+# The dashed line is on top, so a solid line at the same place is visible in the gaps.
 BEFORE: dict[str, Any] = {"color": VERMILLION, "linestyle": (0, (4, 2)), "linewidth": 1.4, "zorder": 3.5}
 AFTER: dict[str, Any] = {"color": BLUE, "linestyle": "-", "linewidth": 1.6, "zorder": 3.0}
 # Lines for the robot without supports are thinner and have other dashes.
@@ -160,7 +160,8 @@ def lay_out(figure: Figure) -> FigureCanvasAgg:
     # Without a canvas, each round of the layout would create another image.
     canvas, engine = FigureCanvasAgg(figure), cast(Any, figure.get_layout_engine())
     if engine is not None:
-        # Panels with equal scales change their size in the first round.  The other rounds adjust their positions.
+        # Panels with equal scales change their size in the first round of the layout.  Two more rounds adjust their
+        # positions.
         equal = [axes for axes in figure.axes if axes.name == "3d" or axes.get_aspect() != "auto"]
         for axes in equal:
             _measure_once(axes)
@@ -206,7 +207,7 @@ def save_all(figures: Mapping[str, Figure], out_dir: Path, formats: Iterable[str
 
 @contextmanager
 def _undated() -> Iterator[None]:
-    """Hide the variable with the date of a reproducible build, because Matplotlib fails if it is not a number."""
+    """Hide SOURCE_DATE_EPOCH, because Matplotlib fails if the value is not a number."""
     date = os.environ.pop("SOURCE_DATE_EPOCH", None)
     try:
         yield

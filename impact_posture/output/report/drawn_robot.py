@@ -28,7 +28,7 @@ from impact_posture.system.text_files import open_regular, read_bytes
 # Maximum number of triangles of all meshes on a page.  More triangles would make the page large, and slow to draw
 # without a GPU.
 _MOST_TRIANGLES = 150_000
-# Number of steps into which the largest extent of a mesh is divided.  Corners are rounded to these steps.
+# Number of rounding steps in the largest extent of a mesh.
 _LEVELS = 65535
 _GRAY = (0.72, 0.74, 0.77, 1.0)
 # Minimum of each color channel, because shading is not visible on darker colors.
@@ -55,7 +55,7 @@ class Solid:
         corners: Corners as integer multiples of ``step`` from ``low``, shape (k, 3).
         faces: Corner indices of each triangle, shape (n, 3).
         low: Lower corner of the bounding box, m, shape (3,).
-        step: Step of the rounding, m.
+        step: Size of a rounding step, m.
     """
 
     corners: StoredArray

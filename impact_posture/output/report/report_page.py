@@ -1,4 +1,4 @@
-"""Write the HTML page of a report.  Only its 3-D viewer needs a script."""
+"""Write the HTML page of a report.  Only the 3-D viewer of the page needs a script."""
 
 from __future__ import annotations
 

@@ -67,7 +67,7 @@ class ReportScene:
     Attributes:
         drawn: Shapes of the robot.
         objective: Objective with robot, contacts and supports.
-        tracks: Motions of the robot.
+        tracks: Motions of the robot that the viewer can show.
         planes: Name (``surface`` or ``ground``), point (m) and unit normal of each plane, world.
         bodies: Vertices of convex obstacles, world, m, shape (k, 3) each.
         ghost: Whether the robot at the first frame stays visible while the robot moves.
@@ -169,7 +169,7 @@ class ReportScene:
 
 
 def impact_curves(impacts: Sequence[ImpactQuantities], metric: Metric, where: str = "") -> list[Curve]:
-    """Return the curves of H, V and S at one contact.  ``where`` is appended to their names."""
+    """Return the curves of H, V and S at one contact; ``where`` is appended to the names of the curves."""
     units = {key: unit for key, unit, _ in quantities(metric)}
     return [
         (name + where, units[name], np.array([getattr(impact, name) for impact in impacts], dtype=float))
@@ -208,7 +208,8 @@ def _levels(columns: Array) -> dict[str, Any]:
 def _differences(rows: NDArray[Any]) -> NDArray[Any]:
     """Return the differences of successive rows, because differences compress better than values.
 
-    Differences of unsigned integers overflow.  The sums in the viewer overflow in the same way, so they are exact.
+    Differences of unsigned integers overflow.  The viewer adds them with the same overflow, so it restores the exact
+    values.
     """
     return np.diff(rows, axis=0, prepend=np.zeros_like(rows[:1]))
 

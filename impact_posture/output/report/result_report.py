@@ -25,7 +25,7 @@ from impact_posture.system.folder_record import typed_command
 from impact_posture.system.scratch_folder import scratch_folder
 from impact_posture.system.text_files import read_text
 
-# Maximum number of frames of a motion over time.
+# Maximum number of animation frames of a motion over time.
 _MOST = 121
 
 
@@ -174,7 +174,7 @@ def _content(folder: Path, prepared: Prepared, view: ResultView, document: dict[
             + (f" {dominated} were stopped early, because they could not become the best." if dominated else ""),
             # Results of earlier versions do not have this block.
             *([document["search"]["line"]] if "search" in document else []),
-            f"{document['redundancy']} degrees of freedom are left by the constraints at the optimum.",
+            f"At the optimum, the constraints leave {document['redundancy']} degrees of freedom.",
             *document["constraints"], *active, *document["notes"], *document["warnings"],
         ),
         sources=(("problem.toml", read_text(folder / "problem.toml")),),
@@ -183,7 +183,7 @@ def _content(folder: Path, prepared: Prepared, view: ResultView, document: dict[
 
 def _verdict(document: dict[str, Any]) -> tuple[str, ...]:
     verdict = document["verdict"]
-    # Results of earlier versions do not have the second line.
+    # Results of earlier versions do not have the key ``minimized``.
     return verdict["line"], *filter(None, [verdict.get("minimized")]), *verdict["advice"]
 
 
@@ -199,7 +199,7 @@ def _before_and_after(prepared: Prepared, document: dict[str, Any]) -> Iterator[
             named = quantities(prepared.impact.metric)
             rows = [QuantityRow(key, before[key], after[key], unit, meaning) for key, unit, meaning in named]
         alone = f", of an impact at {contact.frame} alone" if len(contacts) > 1 else ""
-        alone += "; the objective is of all contacts" if alone and k == 0 else ""
+        alone += "; the objective covers all contacts" if alone and k == 0 else ""
         yield Table(
             f"Before and after{alone}",
             HEAD,

@@ -65,7 +65,8 @@ class FlowPosture(ImpactRobustPosture):
 
     The velocity reference ``ν_ref = −α k Z Zᵀ ∇H/λ`` and its integral, the posture reference ``q_des``, replace the
     impact-robust term.  The columns of ``Z`` span the motions that the other tasks leave free.  ``k = K/K_d`` makes
-    the flow as fast as the impact-robust term.  Bound and fade near joint limits are the same as for this term.
+    the flow as fast as the impact-robust term.  The flow has the same bound and the same fade near joint limits as
+    the impact-robust term.
 
     Attributes:
         basis: Basis ``Z`` of the motions that the other tasks leave free, shape (nv, r); ``None`` to stop the flow.
@@ -115,8 +116,8 @@ class WalkerDriver(RobustDriver):
     def hold(self) -> None:
         """Stop the flow and hold the present posture, center of mass and base orientation."""
         super().hold()
-        # Other tasks can slow the robot.  The reference is then ahead of the robot, so move it to the present
-        # posture.
+        # Other tasks can slow the robot, so that the posture reference is ahead of the robot.  Move the reference to
+        # the present posture.
         self.posture.move_to(self.controller.state.q, self.posture.activation.ramp)
 
 

@@ -53,15 +53,15 @@ class CompiledTick:
         return self.library.reset(q, v)
 
     def tick(self, reading: Reading) -> Command:
-        """Send the changed targets to C and return the command for a reading."""
+        """Send the changed targets to C, and return the command for a sensor reading."""
         self._lead()
         return self.library.tick(reading.t, reading.q, reading.v, reading.force)
 
     def plan(self, times: Sequence[float], lead: Callable[[float], None]) -> tuple[Array, Array]:
         """Call ``lead`` for ticks at n times, and record how it changes the targets.
 
-        Return two arrays.  The first, shape (n, targets), is 1 where a target changes before a tick.  The second,
-        shape (n, targets, 25), contains the changed targets.
+        Return two arrays: an array of shape (n, targets), which is 1 where a target changes before a tick, and an
+        array of shape (n, targets, 25) with the changed targets.
         """
         targets = self.library.targets
         before = {name: row.copy() for name, row in targets.items()}
@@ -83,8 +83,8 @@ class CompiledTick:
         """Send the changed targets to C, and return the names of the tasks with these targets."""
         moved = []
         for task in self._tasks:
-            # Python assigns a new object to change a target, so a different object means a change.  If C changes a
-            # target, the object stays the same.
+            # Python assigns a new object to ``target`` to change a target, so a different object means a change by
+            # Python.
             rates = task.target_velocity, task.target_acceleration
             now = (task.target, rates[0].tobytes(), rates[1].tobytes())
             sent = self._sent.get(task.name)
@@ -125,7 +125,7 @@ def _key(structure: Structure, objective: WorstCaseObjective | None) -> str:
     """
     robot = without_parameters(structure.robot)
     if objective is not None:
-        # The friction of the impact affects only the objectives with a kink between sticking and sliding.
+        # The friction of the impact affects only objectives whose gradient jumps between sticking and sliding.
         friction = objective.contact.friction if objective.impact_kind.kink else 0.0
         objective = replace(objective, robot=robot, contact=replace(objective.contact, friction=friction))
     points = [(robot.model.frames[robot.frame_id(point.frame)], point) for point in structure.points]

@@ -24,9 +24,9 @@ class Reference:
     """Reference trajectory of :class:`RepeatedContacts` along ``−n``, into the surface.
 
     During the approach, the reference accelerates from rest with ``acceleration`` to ``speed`` and keeps this speed
-    until it reaches the surface.  Behind the surface, it brakes uniformly to rest at the distance ``beyond``.  After
-    the time ``dwell``, it returns to the start with the same acceleration and at most the same speed.  Then it rests
-    for the time ``pause``.
+    until it reaches the surface.  Behind the surface, the reference brakes uniformly to rest at the distance
+    ``beyond``.  After the time ``dwell``, the reference returns to the start with the same acceleration and at most
+    the same speed, and rests there for the time ``pause``.
 
     Attributes:
         inward: Duration of the approach, s.
@@ -42,7 +42,7 @@ class Reference:
 
     def __init__(self, task: RepeatedContacts, gap: float) -> None:
         v, a = task.speed, task.acceleration
-        # Use ``v * v``, because an overflow gives infinity.  ``v**2`` would raise an OverflowError.
+        # If ``v`` is huge, ``v * v`` is infinite, but ``v**2`` would raise an OverflowError.
         run_up = v * v / (2 * a)
         if not run_up <= gap:
             what = f"{v:g} m/s at {a:g} m/s² requires {run_up:.3g} m, but the gap is {gap:.3g} m"

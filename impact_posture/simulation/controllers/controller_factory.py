@@ -59,16 +59,16 @@ MEANING: dict[str, str] = {
     "robust-sticking": "like robust, with the gradient of S (jump if the contact sticks)",
     "robust-release": "like robust, without the nominal posture stiffness until H stops decreasing",
     "robust-flow": "the posture flows to lower H before the impact, without a gain",
-    "robust-flow-sticking": "like robust-flow, to lower S, for impacts at a given speed",
+    "robust-flow-sticking": "like robust-flow, but lowers S instead of H, for impacts at a given speed",
     "posture": "moves to the offline optimum, without the gradient",
     "posture-sticking": "like posture, with the optimum of S, for impacts at a given speed",
     "path": "like posture, but along a timed path without collisions",
     "strike": "arrives at the optimum of the sticking jump with the stated speed along a path, then stops",
-    "stiff": "holds the start posture, with the stiffness that the term has where robust rests",
+    "stiff": "holds the start posture, as stiff as the impact-robust term is where robust comes to rest",
     "posture-stiff": "like posture, with the stiffness of the impact-robust term at the optimum",
     "invariant": "nominal, but impulses do not affect the velocity feedback around the impact",
     "reference-spreading": "nominal, with references before and after the impact, without velocity feedback between",
-    "impact-aware": "nominal, with a speed that keeps joint rates and torques of an impact within limits",
+    "impact-aware": "nominal, with an approach so slow that an impact keeps joint rates and torques within limits",
     "walker": "the posture target follows the negative gradient of H",
 }
 CONTROLLERS = tuple(MEANING)
@@ -142,7 +142,7 @@ class ControllerFactory:
         return self._objectives[kind]
 
     def gradient(self, kind: ObjectiveKind = "impulse") -> Gradient:
-        """Return the gradient of :meth:`objective`.  If it cannot be compiled, interpret it and add a warning."""
+        """Return the gradient of :meth:`objective`, compiled or, with a warning, interpreted if compiling fails."""
         if kind not in self._gradients:
             try:
                 self._gradients[kind] = self.gradient_of(self.objective(kind)), ()

@@ -163,7 +163,7 @@ class PostureDriver(Driver):
         return super().reset(q)
 
     def brace(self) -> None:
-        """Move posture, center of mass and base orientation to the offline posture within :data:`MOVE`."""
+        """Move posture, center of mass and base orientation to the offline posture within :data:`MOVE` seconds."""
         self._call_posture("move_to", self._goal, MOVE)
         model = self.setup.robot.model
         for task in self._body_tasks:

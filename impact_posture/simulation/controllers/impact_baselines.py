@@ -78,11 +78,11 @@ class InvariantDriver(ImpactFeedbackDriver):
     There are three differences from the paper:
 
     1. A force sensor corrects the scheduled time ``t*`` of the impact.
-    2. If there are other tasks, the posture task does not affect ``λ*``, because the posture target is at rest while
-       the other tasks move.  The paper has no redundant posture.
+    2. The posture task affects ``λ*`` only if there are no other tasks, because the posture target rests while other
+       targets move.  The paper has no redundant posture.
     3. The impulses at standing feet follow from the impulse at the contact (``M⁻¹`` contains the constraints of the
-       feet).  In the paper, the impulses at the feet are free variables.  Here, free impulses could explain every
-       velocity of center of mass and base, so no feedback would remain.
+       feet).  In the paper, the impulses at the feet are free variables.  On our robots, free impulses at the feet
+       could cause every velocity of center of mass and base, so the feedback of these tasks would vanish.
     """
 
     WINDOW, FADE = 0.05, 0.0025
@@ -117,9 +117,9 @@ class ReferenceSpreadingDriver(ImpactFeedbackDriver):
     - Before the impact, the target speed is a function of the position: ``√(2 a s)``, at most the speed of the
       scenario.  The reference continues behind the surface, in case the impact is late.  There is no position
       feedback along the approach.
-    - The interim mode starts at the first touch.  The interim mode ends when the contact has lasted for ``SUSTAINED``
-      (s), or after ``INTERIM`` (s).  In this mode, no task has velocity feedback.  The position target continues with
-      the speed before the impact, which establishes the contact.
+    - The interim mode of the paper starts at the first touch.  The interim mode ends when the contact has lasted for
+      ``SUSTAINED`` (s), or after ``INTERIM`` (s).  In the interim mode, no task has velocity feedback.  The position
+      target continues with the speed before the impact, which establishes the contact.
     - After the impact, the position target moves exponentially, with the time constant ``SETTLE`` (s), to the rest
       position of the scenario.  The velocity targets of all tasks start at ``J_y ν⁺`` and decay with the same time
       constant.  ``ν⁺ = ν⁻ + Δν`` is the velocity after a rigid, inelastic impact at the velocity ``ν⁻`` before the
@@ -134,10 +134,10 @@ class ReferenceSpreadingDriver(ImpactFeedbackDriver):
     """
 
     SUSTAINED, INTERIM, SETTLE = 0.005, 0.05, 0.03
-    # The target speed before the impact is computed with at least this distance, m.  With zero, the robot would never
-    # start.
+    # The target speed before the impact is computed with at least this distance ``s``, m.  At ``s = 0``, the target
+    # speed would be zero, and the robot would never start.
     BEGIN = 2e-3
-    # Distance of the target along the approach at the touch, m.  It increases in the interim mode.
+    # Distance ``s`` of the position target, m: its value at the first touch, which increases in the interim mode.
     _touch: float
     # Duration of the contact, s.
     _lasted: float
@@ -204,9 +204,10 @@ class ImpactAwareDriver(Driver):
     approach is therefore at most as fast as the limits of the robot allow.  If the limits allow the speed of the
     scenario, the commands are the same as from the nominal controller.
 
-    There are two differences from the paper.  First, limits that the present state violates are relaxed, like joint
-    limits; the paper does not treat this case.  Second, the forces at the feet during the impact are not limited.  In
-    the paper, standing feet also satisfy zero-moment point and friction constraints during the impact.
+    There are two differences from the paper.  First, limits that the present state violates are relaxed in the same
+    way as joint limits; the paper does not treat violated limits.  Second, the forces at the feet during the impact
+    are not limited.  In the paper, standing feet also satisfy zero-moment point and friction constraints during the
+    impact.
     """
 
     def __init__(self, setup: Setup, posture: JointPosture) -> None:

@@ -89,8 +89,9 @@ class StrikeDriver(Driver):
 class LandingDriver(StrikeDriver):
     """Controller of a robot that falls freely and lands on its feet.
 
-    In the fall, a controller without contacts holds the joints on the path.  From the contact on, the controller of
-    the standing robot follows the planned stop, or holds the posture of the contact if the path has no stop.
+    During the fall, the joints follow the path under a controller without contact constraints.  From the contact on,
+    the controller of the standing robot follows the planned stop, or holds the posture of the contact if the path has
+    no stop.
     """
 
     def __init__(self, setup: Setup, posture: JointPosture, path: PosturePath) -> None:

@@ -96,7 +96,7 @@ class ContactLog:
         self._steps.append(_Step(number, data.time, *(part.copy() for part in parts)))
 
     def fold(self, number: int) -> None:
-        """Evaluate the recorded steps if there are at least :data:`_MOST` recorded steps and no mark."""
+        """Evaluate the recorded steps if there are :data:`_MOST` or more, and :meth:`look` has nothing to return."""
         if len(self._steps) >= _MOST and not self._marks:
             self._marks.append((number, None))
             *_, peak, began, _ = self.look()
@@ -122,17 +122,17 @@ class ContactLog:
         return list(force.tolist())
 
     def look(self) -> tuple[Array, ...]:
-        """Return the quantities of :class:`ShapeTruth` except ``frame`` at all n marks, and clear the marks.
+        """Return the quantities of :class:`ShapeTruth` except ``frame`` at the n calls of :meth:`mark`.
 
-        The first axis has one entry per mark, and the second axis has one entry per shape.  ``began`` is NaN if no
-        surface touched the shape since the previous mark.
+        The first axis has one entry per call, and the second axis has one entry per shape.  ``began`` is NaN if no
+        surface touched the shape since the previous call.
         """
         ends, count = np.array([number for number, _ in self._marks]), self._count
         numbers, n = np.array([step.number for step in self._steps]), ends.size
-        # If a run ends within a tick, some steps come after the last mark.  These steps stay recorded.
+        # If a run ends within a tick, the steps after the last call of :meth:`mark` stay recorded.
         looked = int(np.searchsorted(numbers, ends[-1], side="right"))
         steps, numbers, self._steps = self._steps[:looked], numbers[:looked], self._steps[looked:]
-        # Marks without a step since the last evaluation have the contacts of this evaluation.
+        # If no step was taken since the last evaluation, the contacts are the same as at the last evaluation.
         unmoved = ends == self._number
         force, normal = self._force * unmoved[:, None, None], self._normal * unmoved[:, None]
         impulse, peak, began = np.zeros((n, count, 3)), np.zeros((n, count)), np.full((n, count), np.inf)

@@ -57,7 +57,7 @@ class ContactLaw(StrictTable):
 
         A mass hits the surface along the normal with the approach ``speed``, m/s.  No other force acts on the mass.
         The time steps are the steps of MuJoCo, ``r' ← r' + h r''`` and ``r ← r + h r'``, where ``h`` is the
-        ``timestep``, s.  The result is zero if the mass does not approach.
+        ``timestep``, s.  The result is zero if ``speed`` is not positive.
         """
         if speed <= 0:
             return 0.0

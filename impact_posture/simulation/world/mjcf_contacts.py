@@ -48,8 +48,8 @@ def solid_links(robot: Robot) -> Iterator[tuple[int, str, pin.Frame, list[int]]]
 def add_link_geoms(mjcf: Mjcf, robot: Robot) -> dict[str, LinkGeom]:
     """Add solid geoms, excluded pairs of bodies and contact pairs from the MJCF of a robot; return the geoms by name.
 
-    Each body of the file becomes a body without mass, fixed to the joint that moves it.  Its contacts are as soft as
-    in the file.  If joints are locked, the contacts of a body are as soft as contacts of its joint.
+    Each body of the file becomes a body without mass, fixed to the joint that moves it.  Contacts of this new body
+    are as soft as in the file.  If joints are locked, they are as soft as contacts of the link that the joint moves.
     """
     if robot.mjcf is None:
         return {}
@@ -75,10 +75,10 @@ def add_link_geoms(mjcf: Mjcf, robot: Robot) -> dict[str, LinkGeom]:
                 mjcf.spec.add_hfield(name=names[g], nrow=rows, ncol=columns, size=size, userdata=heights)
                 law["hfieldname"] = names[g]
             body.add_geom(name=names[g], type=source.geom_type[g], size=source.geom_size[g], mass=0.0, **law, **at)
-    # Locked joints merge bodies.  Therefore, exclude each pair of bodies that are next to each other in the file.
+    # Locked joints merge bodies.  Therefore, replace MuJoCo's filter of parent and child by the pairs in the file.
     mjcf.spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_FILTERPARENT
     parents_touch = source.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT
-    # Bodies that are fixed to the world collide with the bodies next to them.
+    # Bodies that are fixed to the world collide with their children.
     moving = [] if parents_touch else np.flatnonzero(source.body_weldid).tolist()
     for first, second in excluded_pairs(source, moving):
         if first in bodies and second in bodies:

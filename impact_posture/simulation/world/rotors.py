@@ -50,7 +50,7 @@ class Rotors:
         return np.asarray(np.minimum(np.maximum(command, self._lowest), self._highest))
 
     def steps(self, command: Array, count: int) -> Array:
-        """Take ``count`` time steps under a command within the limits.  Return the speeds, shape (count, rotors)."""
+        """Take ``count`` steps under a command within the limits; return the speeds, shape (count, rotors)."""
         difference = command - self.speeds
         # A speed never overshoots its command, so the same time constant applies to all steps.
         speeds = self.speeds - np.where(difference > 0, *self._changes_in(count)) * difference
@@ -75,7 +75,7 @@ class Rotors:
 
 
 class Vibration:
-    """Vibration of unbalanced propellers in the measured twist of the base.  The body itself does not vibrate.
+    """Vibration of unbalanced propellers, added to the measured twist of the base but not to its motion.
 
     Propeller i at ``p_i`` with unbalance U (kg·m) turns with the speed ω_i about ``d_i``.  The centrifugal force is
     ``U(2πω_i)² e_i``.  The unit vector ``e_i = cos φ_i x_i + s_i sin φ_i y_i`` turns in the plane of the propeller,
@@ -105,7 +105,7 @@ class Vibration:
         self.phases = np.array(phases)
 
     def steps(self, speeds: Array, timestep: float) -> Array:
-        """Turn the propellers with ``speeds``, one row per time step.  Return their angles, shape (count, rotors)."""
+        """Turn the propellers with ``speeds``, one row per step; return the angles, shape (count, rotors)."""
         phases = self.phases + 2 * np.pi * timestep * speeds.cumsum(axis=0)
         self.phases = phases[-1]
         return np.asarray(phases)

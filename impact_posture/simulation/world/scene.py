@@ -46,14 +46,14 @@ class Shape(StrictTable):
     """Massless shape on the robot that can touch surfaces.
 
     Attributes:
-        frame: Frame to which the shape is fixed.  The shape has the same name.
+        frame: Frame to which the shape is fixed, and name of the shape.
         size: Radius of a sphere, or three half extents of a box, m.
         kind: ``sphere``; ``box`` with its edges along the axes of the frame; or ``link``, the solid geoms that the
             MJCF of the robot has at the link of the frame.
         offset: Contact point in the coordinates of the frame, m.
         center: Center of a sphere or box in the coordinates of the frame, m.  By default, the center follows from
-            ``offset``.  ``offset`` is then the point of the sphere, or the middle of the face of the box, that is
-            nearest to the surface :meth:`Scene.faced` in the start posture.
+            ``offset``.  In this case, ``offset`` is the point of the sphere, or the middle of the face of the box,
+            that is nearest to the surface :meth:`Scene.faced` in the start posture.
     """
 
     frame: str
@@ -91,7 +91,7 @@ class Physics(StrictTable):
     stop_solimp: FiniteVector = (0.95, 0.99, 0.001)
 
     def __post_init__(self) -> None:
-        """Check that MuJoCo would use the contact law of the stops without a change."""
+        """Check that MuJoCo would not change the contact law of the joint stops."""
         ContactLaw(solref=self.stop_solref, solimp=self.stop_solimp)
 
 

@@ -22,7 +22,7 @@ from impact_posture.system.optional_package import import_mujoco
 FLIGHT = 0.01
 # Name of the body and of the geom of the ball.
 BALL = xml_name("thrown ball")
-# Position of the ball before the throw, m.  The ball falls freely from there, far away from the robot.
+# Position of the ball at the start of a run, m.  Until the throw, the ball falls freely, far away from the robot.
 _AWAY = (0.0, 0.0, -1e3)
 # Tangential mobility at the surface of a solid sphere times the mass of the sphere: 1 + mr²/I with I = ⅖ mr².
 _SPIN = 3.5

@@ -272,7 +272,7 @@ class World:
         return {"noise": self._noise.draw(n), **self._pushes.in_c()}
 
     def go_to(self, steps: int) -> None:
-        """Set the number of steps since the reset, after C has taken them."""
+        """Set the number of physics steps since the reset, after C code has computed steps."""
         self._steps = steps
 
     def _check_ready(self) -> None:

@@ -122,7 +122,7 @@ def build_scene(robot: Robot, scene: Scene, q: Array, throw: Throw | None = None
 
 
 def _add_link(mjcf: Mjcf, links: Mapping[str, LinkGeom], joint: int, name: str) -> tuple[str, ...]:
-    """Add copies of the solid geoms of a link that touch only surfaces, and return their names."""
+    """Copy the solid geoms of a link, so that the copies touch only surfaces, and return the names of the copies."""
     names = []
     for geom in (mjcf.spec.geom(geom) for geom, link in links.items() if link.joint == joint):
         names.append(f"{name} ({geom.name})")
@@ -131,7 +131,7 @@ def _add_link(mjcf: Mjcf, links: Mapping[str, LinkGeom], joint: int, name: str) 
             pos=geom.pos, quat=geom.quat, mass=0.0, contype=0, conaffinity=0,
         )  # fmt: skip
     if not names:
-        hint = "give it a sphere or a box, or take an MJCF in which geoms of the link collide"
+        hint = "give the shape the kind sphere or box, or take an MJCF in which geoms of the link collide"
         raise InputError("its link has no solid geoms", where=name, hint=hint)
     return tuple(names)
 
@@ -145,7 +145,7 @@ def _add_rotor_link(mjcf: Mjcf, robot: Robot) -> tuple[list[str], Array]:
     propulsion, names, points = robot.spec.propulsion, [], [np.zeros((0, 3))]
     shapes = [] if propulsion is None else read_shapes(robot)[0]
     for shape in (shape for shape in shapes if propulsion is not None and shape.link == propulsion.frame):
-        # Skip shapes that cannot be used.  The warnings of the robot already name them.
+        # Skip unusable shapes, which the warnings of the robot already name.
         with suppress(UnusableShape):
             corners = shape_points(shape.load(largest_extent(robot)).mesh)
             link = robot.model.frames[robot.frame_id(shape.link)]

@@ -24,15 +24,15 @@ LEAST_VALUE = 1e-8
 LEVEL = 1e-6
 # Largest violation of a limit during braking, rad (m) for joints, and a fraction of the range for static controls.
 NEAR = 1e-3
-# The flow may move along a limit that it violates by less than this, in the units of ``NEAR``.  If this value equaled
-# ``NEAR``, the flow would slowly cross the limit.
+# The flow may move along a limit that it violates by less than this, in the same units as ``NEAR``.  If this value
+# equaled ``NEAR``, the flow would slowly cross the limit.
 SPENT = 9.9e-4
 # Distance that the flow keeps from the joint limits, rad (m).
 AIM = 2e-3
 # Distance that the flow keeps from the limits of the static controls, as a fraction of the range.  This distance is
 # larger than ``AIM``, because the slope of the static controls is only estimated.
 RESERVE = 8e-3
-# A row of the limits is ignored if the square of its length along the free directions is smaller than this.
+# A limit is ignored if the squared norm of its row, projected onto the redundancy, is smaller than this.
 FLAT = 1e-6
 _PositiveShare = Annotated[float, Demand(lambda value: 0 < value <= 1, "a number above zero, up to 1")]
 
@@ -137,7 +137,7 @@ class FlowDirection:
 
         ``rooms`` are the distances from the center of mass to the edges of the polygon, minus the margin, m, shape
         (k,).  ``shares`` are the static controls, shape (controls,).  ``coasting`` is the displacement of the flow
-        while it brakes, shape (nv,).  The limits are tightened by this displacement.
+        while it brakes, shape (nv,).  The limits are tightened by ``coasting``.
         """
         upper, lower = self._qp.upper[self._qp.n :], self._qp.lower[self._qp.n :]
         count, k = self._joints.size, self._edges.shape[0]
@@ -190,7 +190,7 @@ class FlowDirection:
         return self._solve(Z, -Z.T @ displacement)
 
     def downhill(self, Z: Array, gradient: Array, flow: Array, stop: Array, step: Array) -> Array:
-        """Return ``step`` without the part that increases ``H`` here or at the point where the flow stops.
+        """Return ``step`` without the part that increases ``H`` at the present ``q_r`` or where the flow stops.
 
         ``step`` is a change of the velocity ``flow``, shape (nv,).  ``Z`` is the basis of the redundancy, shape
         (nv, r), and ``gradient`` is ``∇H/H₀``.  ``stop`` is the displacement within which the flow stops.
@@ -213,8 +213,8 @@ class FlowDirection:
     def _tilt_change(self, displacement: Array, along: float) -> float:
         """Return the change of the tilt angle caused by a displacement, shape (nv,).
 
-        ``along`` is the part of the base rotation about the tilt axis, rad.  The horizontal part across this axis
-        increases the tilt to second order.
+        ``along`` is the part of the base rotation about the tilt axis, rad.  A horizontal rotation perpendicular to
+        the tilt axis increases the tilt to second order.
         """
         turn = float(self._vertical @ displacement[3:6])
         aside = float(displacement[3:6] @ displacement[3:6]) - turn**2 - along**2

@@ -11,14 +11,14 @@ from impact_posture.tsid.flow.flow_direction import FlowDirection, FlowOptions
 from impact_posture.tsid.flow.redundancy import Redundancy
 from impact_posture.tsid.flow.zero_moment_point import ZeroMomentPoint
 
-# Attempts per candidate of `change`: first unchanged, then twice without the part that crosses limits.
+# Number of attempts per candidate of ``change``: the candidate, then twice what remains within the limits.
 ATTEMPTS = 3
 # The flow assumes a fraction of the largest acceleration for braking.  This fraction is at least ``ABLE``, and
 # increases by at most ``ABLE`` per change.
 ABLE = 0.1
 # Safety factor of the braking time, because the slopes of the limits change during braking.
 CAUTION = 1.5
-# Largest ratio of the speed of the flow to its step, 1/s.
+# The speed of the flow is at most this multiple of the step ``δ``, 1/s.
 RATE = 4.8
 # Smallest divisor when a speed is divided by a step, rad (m); prevents a division by zero.
 _TINY = 1e-12
@@ -27,7 +27,7 @@ RETURN = 0.1
 
 
 class FlowGovernor:
-    """Velocity of the reference flow on the constraints, and its changes.
+    """Velocity of the reference flow that keeps the constraints, and the permitted changes of this velocity.
 
     Attributes:
         flow: Velocity ``u`` of the flow, without the part that returns to the constraints, rad/s (m/s), shape (nv,).
@@ -52,9 +52,9 @@ class FlowGovernor:
         return self.returning
 
     def stopping(self, flow: Array) -> float:
-        """Return the time, s, in which a constant deceleration stops a motion with the velocity ``flow``.
+        """Return the time ``T``, s, in which a constant deceleration stops a motion with the velocity ``flow``.
 
-        Without deceleration, the motion would cover twice the braking distance in this time.
+        The braking distance is ``flow·T/2``.
         """
         return float(np.abs(flow).max()) / self._options.acceleration
 
@@ -65,8 +65,9 @@ class FlowGovernor:
 
         The function tries three candidates:
 
-        1. Each joint uses its full acceleration, and the change is projected on the constraints.  Unless the change
-           slows the flow down, the part that moves the zero moment point too far is removed.
+        1. Each joint uses its full acceleration, and the change is projected onto the motions that keep the
+           constraints.  Unless the change slows the flow down, the part that moves the zero moment point too far is
+           removed.
         2. The velocity changes straight towards the wanted velocity.
         3. The velocity decreases without a change of direction.
 
@@ -74,9 +75,9 @@ class FlowGovernor:
         result is the first attempt after which the flow can stop within the limits.  The flow assumes the
         deceleration that the actuators permitted in the last changes.
 
-        ``step`` is ``δ``, shape (nv,).  ``fastest`` is the largest speed of an entry, rad/s (m/s).  The change takes
-        ``period`` seconds.  If ``slope`` is ``∇H/H₀``, shape (nv,), the change must not increase ``H``; ``None``
-        permits an increase.
+        ``step`` is ``δ``, shape (nv,).  ``fastest`` is the largest speed of an entry, rad/s (m/s).  The velocity
+        changes within ``period`` seconds.  If ``slope`` is ``∇H/H₀``, shape (nv,), the change must not increase
+        ``H``; ``None`` permits an increase.
         """
         options, direction, Z, flow = self._options, self._direction, space.basis, self.flow
         most = options.acceleration * period
@@ -120,7 +121,7 @@ class FlowGovernor:
         return limited(after, fastest) - self.flow if np.abs(after).max(initial=0.0) > fastest else change
 
     def _braking(self, change: Array, period: float) -> float:
-        """Return the time, s, in which the new velocity covers the distance of change and braking together."""
+        """Return the time, s, in which the changed velocity covers the distance of change and later braking."""
         return CAUTION * self.stopping(self.flow + change) / 2 / self._able + period
 
 

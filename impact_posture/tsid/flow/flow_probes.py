@@ -34,7 +34,7 @@ class ProbeDirections:
         self.count = 0
 
     def next(self, space: Redundancy) -> Array:
-        """Return the next unit vector, shape (nv,).  It is orthogonal to the earlier vectors of the round."""
+        """Return the next unit vector, shape (nv,), which is orthogonal to the earlier vectors of its round."""
         k = self.count % space.basis.shape[1]
         z, seen = self._seen[k], self._seen[:k]
         z[:] = self._fixed[k]

@@ -9,8 +9,8 @@ import numpy as np
 from impact_posture.system.arrays import Array
 
 # A direction gets a spring instead of a constraint if its singular value is below this fraction of the largest one.
-# Rows of points on one body can be almost dependent.  As constraints, these rows would switch on and off from posture
-# to posture, and the flow would never rest.
+# Rows of points on one body can be almost dependent.  If such rows were constraints, they would switch on and off
+# from posture to posture, and the flow would never rest.
 SLACK = 2e-2
 # Stiffness of the springs relative to ``H₀``, 1/m²: the energy at an error of 6 mm is about half of ``H₀``.
 SPRING = 3e4
@@ -21,10 +21,10 @@ IDLE = 1e-9
 
 @dataclass(frozen=True)
 class Redundancy:
-    """Free directions of the constraints, from the decomposition ``J = U S Vᵀ``, and a pseudo-inverse of ``J``.
+    """Directions that do not change the constraints (null space of ``J = U S Vᵀ``), and a pseudo-inverse of ``J``.
 
     Attributes:
-        basis: Orthonormal basis ``Z`` of the free directions, shape (nv, r).
+        basis: Orthonormal basis ``Z`` of the null space, shape (nv, r).
         inverse: Pseudo-inverse ``J⁺`` on the constrained directions, shape (nv, rows).
         springs: ``k JZ`` of nearly dependent constraints, which are springs of stiffness ``k``, shape (rows, r);
             ``None`` without springs.
@@ -53,11 +53,11 @@ class Redundancy:
         return cls(Z, (Vt[:rank].T / s[:rank]) @ U[:, :rank].T, springs, stiffness)
 
     def project(self, vector: Array) -> Array:
-        """Return the projection of a vector, shape (nv,), on the free directions."""
+        """Return the projection of a vector, shape (nv,), onto the null space."""
         return np.asarray(self.basis @ (self.basis.T @ vector))
 
     def back(self, rate: Array, base: int) -> Array:
-        """Return the velocity, shape (nv,), with the slowest joints that changes the constraints at ``rate``.
+        """Return the velocity, shape (nv,), that changes the constraints at ``rate`` and moves the joints least.
 
         ``rate`` has the shape (rows,).  The first ``base`` entries of the velocity belong to the base.
         """

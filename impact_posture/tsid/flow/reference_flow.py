@@ -30,8 +30,8 @@ from impact_posture.tsid.tasks.task import Task
 PROBE = 1e-4
 # Curvature estimates are updated only if two evaluations are at least this far apart, rad (m).
 MOVED = 1e-6
-# If the step towards a posture of the path is shorter than this, rad (m), the flow continues to the next posture.
-# The flow has then reached the posture, or the limits permit no closer posture.
+# If the step towards a posture of the path is shorter than this, rad (m), the flow continues to the next posture.  A
+# step is short if the flow has reached the posture, or if limits prevent this.
 REACHED = 0.02
 # Speed below which a flow that is off is set to rest, rad/s (m/s).
 STILL = 1e-5
@@ -40,7 +40,7 @@ SLOW = 1e-3
 # Number of ticks from one update of the flow to the next.
 UPDATE_TICKS = 14
 # ``UNTIL`` is the tick of the first change of the motion in an update.  ``SINCE`` is the number of ticks from the
-# second change to the next evaluation.
+# second change of the motion to the next update.
 UNTIL, SINCE = 4, 3
 
 
@@ -52,8 +52,8 @@ class ReferenceFlow:
 
     An update takes :data:`UPDATE_TICKS` ticks.  Four of these ticks (0, 4, 11 and 13) define the motion.  Tick 0
     evaluates ``H``, ``∇H`` and the limits.  Ticks 4 and 11 change the acceleration.  Tick 13 computes the step from
-    ``q_r`` at this tick and decides whether the flow rests.  The C controller does the same at these ticks; only C
-    spreads work over the other ticks.
+    ``q_r`` at this tick and decides whether the flow rests.  The C controller does the same at these four ticks, and
+    does parts of the work at the other ticks.
 
     Contacts stay at their places.  Strict and weighted tasks stay at their targets.  Only the ``led`` tasks (center
     of mass, base orientation) follow the flow.  Joints that ``robot.toml`` lists under ``hold`` do not move.
@@ -65,7 +65,8 @@ class ReferenceFlow:
         value: ``H(q_r)`` at the last update.
         start: ``H₀``, the absolute value of ``H`` at the reset.
         on: Whether the flow may move.
-        resting: Whether the flow rests because the predicted decrease of ``H`` is too small or its time is over.
+        resting: Whether the flow rests because the predicted decrease of ``H`` is too small or its ``duration`` is
+            over.
         failed: Whether the last evaluation raised an exception or was not finite; the flow then brakes.
         led: Tasks that follow the flow.
         error: Errors of contacts and tasks at the last update, m and rad, then zeros for held joints.
@@ -181,7 +182,7 @@ class ReferenceFlow:
         return self.on or bool(self.velocity.any())
 
     def _look(self) -> None:
-        """Evaluate objective, constraints and limits at the predicted ``q_r`` of the next change of the motion.
+        """Evaluate objective, constraints and limits at ``q_r`` as predicted for the next change of acceleration.
 
         Update the curvature estimates from the differences to the last evaluation.
         """
@@ -267,14 +268,14 @@ class ReferenceFlow:
         options = self.options
         period, self._elapsed = self._elapsed, 0.0
         if not period > 0:
-            # The previous change was at the same time, so the acceleration is undefined.
+            # No time has passed since the previous change, so the acceleration is undefined.
             return
         error = np.abs(pin.difference(self._model, measured, self.q)[self._base :]).max(initial=0.0)
         fastest = options.speed * max(1.0 - error / options.tracking, 0.0)
         if self.on and not self.resting and self._visited == len(self._path):
             self._moved += period
-        # The flow keeps its speed until the next change.  After that change, 2/5 of the largest acceleration must
-        # suffice to stop the flow in the remaining time.
+        # The flow keeps its speed until the next change.  From the next change on, 2/5 of the largest acceleration
+        # must suffice to stop the flow in the remaining time.
         self._remains = min(self._deadline - self._clock, options.duration - self._moved) - 2 * period
         fastest = min(fastest, 0.4 * options.acceleration * max(self._remains, 0.0))
         if not self.on:
@@ -292,7 +293,7 @@ class ReferenceFlow:
         known = (governor.flow + back + along - self.velocity) / period
         self._zmp.limit(self._state, known)
         change, brakes = governor.change(self._space, self._wanted, fastest, period, slope, self._zmp)
-        # Braking before a limit may use more of the actuators' remaining range.
+        # Braking may use a larger fraction of the remaining range of the actuators than acceleration.
         most = (1 + options.haste) / 2 if brakes else options.haste
         part = self._static.permitted(self._state.M, known, change / period, self.shares, most)
         self.acceleration[:] = known + governor.take(change, part) / period

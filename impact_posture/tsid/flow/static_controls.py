@@ -43,8 +43,8 @@ class StaticControls:
         self.limited = np.flatnonzero(np.isfinite(actuators.upper) & np.isfinite(actuators.lower))
         lower, upper = actuators.lower[self.limited], actuators.upper[self.limited]
         self._middle, self._half = (upper + lower) / 2, share * (upper - lower) / 2
-        # ``_whole`` is half of the full range.  ``_least`` is the least range that accelerations may use.  Both are
-        # in units of half of the permitted range.
+        # Half of the full control range, and the least range that accelerations may use.  The unit of ``_whole`` and
+        # ``_least`` is half of the range that the static controls may use.
         self._whole, self._least = 1.0 / share, LEFT / share
         wrench = np.array([1.0] * 3 + [MOMENT] * 3)
         self._ease = 1.0 / np.concatenate([np.zeros(0), *(wrench[: c.size] for c in contacts)])
@@ -54,7 +54,8 @@ class StaticControls:
         # Generalized forces of the contacts per unit wrench on the base, shape (nv, base).
         self._carried = np.zeros((actuators.G.shape[0], base))
         if contacts:
-            # Imported here, because the import of SciPy is slow.  For six unknowns, NumPy needs three times as long.
+            # Imported here, because the import of SciPy is slow.  For six unknowns, NumPy needs three times as long
+            # as this SciPy function.
             from scipy.linalg.lapack import dposv
 
             self._solve = dposv
@@ -81,9 +82,9 @@ class StaticControls:
     def permitted(self, M: Array, known: Array, more: Array, shares: Array, most: float) -> float:
         """Return the fraction of the acceleration ``more``, 0 to 1, that the actuators permit.
 
-        The acceleration ``known``, shape (nv,), cannot be changed.  The static controls ``shares``, shape (m,), leave
-        a part of the control ranges.  The sum of both accelerations may use the fraction ``most`` of this part.  The
-        contact forces follow from the last call of :meth:`shares`.
+        The acceleration ``known``, shape (nv,), is used in any case.  ``known`` and the permitted part of ``more``
+        may together use the fraction ``most`` of the control ranges that the static controls ``shares``, shape (m,),
+        do not use.  The contact forces follow from the last call of :meth:`shares`.
         """
         self._pair[:, 0], self._pair[:, 1] = known, more
         taken, added = self._needed(M @ self._pair).T

@@ -31,8 +31,8 @@ class ZeroMomentPoint:
     def __init__(self, edges: Array, offsets: Array, state: State, contacts: Sequence[SupportContact]) -> None:
         """Set the polygon and the height of the ground.
 
-        ``edges`` contains ``n``, shape (k, 2), and ``offsets`` contains ``b``, shape (k,).  The first contact at
-        ``state`` is on the ground.
+        ``edges`` contains ``n``, shape (k, 2), and ``offsets`` contains ``b``, shape (k,).  The height is the height
+        of the first contact at ``state``.
         """
         bounded = np.isfinite(offsets)
         self._edges, self._offsets = edges[bounded], offsets[bounded]
@@ -42,7 +42,7 @@ class ZeroMomentPoint:
     def limit(self, state: State, known: Array) -> None:
         """Set the rows at a state with ``ν = 0``, and their bounds, N·m.
 
-        The acceleration ``known``, shape (nv,), cannot be changed, so its effect is subtracted from the bounds.
+        The acceleration ``known``, shape (nv,), is used in any case, so its effect is subtracted from the bounds.
         """
         if not self._offsets.size:
             return

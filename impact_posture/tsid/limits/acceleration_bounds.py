@@ -28,8 +28,8 @@ class LimitLaw:
 
     Attributes:
         approach: Permitted speed towards a limit, divided by the distance from the limit, 1/s.
-        rate: Permitted acceleration, divided by the difference between the permitted and the present speed, 1/s.  It
-            is at least ``4·approach``; otherwise, a joint could swing through its limit.
+        rate: Permitted acceleration, divided by the difference between the permitted and the present speed, 1/s.
+            ``rate`` is at least ``4·approach``; otherwise, a joint could swing through its limit.
         deceleration: Deceleration available for braking, rad/s² (m/s²).
         acceleration: Largest acceleration of a joint, rad/s² (m/s²); infinite means no bound.
         margin: Distance from a position limit at which joints stop, rad (m); limited to a quarter of the joint's

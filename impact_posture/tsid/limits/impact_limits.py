@@ -96,7 +96,8 @@ class ImpactLimits:
     def rows(self, state: State) -> tuple[Array, Array, Array]:
         """Return the rows on ``ν̇``, their lower bounds and their upper bounds.
 
-        The first half limits the joint rates after the impact; the second half limits the impulsive torques.
+        The first half of the rows limits the joint rates after the impact; the second half limits the impulsive
+        torques.
         """
         nothing = np.full(self.size, np.inf)
         if not self.active:

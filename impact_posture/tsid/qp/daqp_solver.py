@@ -15,8 +15,8 @@ SOLVED, _NONE = (1, 2), -1
 _FAILED = 0
 # Settings of DAQP.  ``primal_tol`` is the largest violation of a bound.  ``iter_limit`` is the largest number of
 # iterations.  ``sing_tol`` is the squared sine of the smallest angle between a row and the active rows.  For a
-# quadruped, the cost has the condition number 4e10 and makes rows nearly parallel.  The default ``sing_tol`` of DAQP,
-# 3.7e-11, would treat these rows as dependent.
+# quadruped, the cost has the condition number 4e10 and makes rows nearly parallel.  With its default ``sing_tol`` of
+# 3.7e-11, DAQP would treat such rows as dependent.
 SETTINGS = {"primal_tol": 1e-9, "iter_limit": 1000, "sing_tol": 1e-13}
 
 
@@ -29,8 +29,9 @@ class DaqpSolver:
     def __init__(self, n: int, m: int, *, proximal: float | None = None) -> None:
         """Allocate a workspace for ``n`` variables and ``m`` rows.
 
-        ``proximal`` is the weight of proximal-point iterations.  With ``None``, DAQP decides whether to use such
-        iterations.  These iterations take more time, but they also solve a program whose Hessian is nearly singular.
+        ``proximal`` is the weight of proximal-point iterations.  Proximal-point iterations take more time, but also
+        solve a program whose Hessian is nearly singular.  With ``None``, DAQP decides whether to use proximal-point
+        iterations.
         """
         self._flag = 1
         self._model = daqp.Model()
@@ -66,8 +67,7 @@ class WhitenedSolver(DaqpSolver):
     """DAQP with the change of variables ``y = Rz``, where LAPACK factorizes ``H = RᵀR``.
 
     DAQP alone factorizes ``H`` by plain loops, which take most of the solution time for a humanoid.  LAPACK and one
-    matrix product take half as long as these loops.  Bounds on the dense variables become rows.  The rest of ``H``
-    must be diagonal.
+    matrix product take half as long.  Bounds on the dense variables become rows.  The rest of ``H`` must be diagonal.
     """
 
     def __init__(self, n: int, m: int, dense: int) -> None:

@@ -52,8 +52,8 @@ def lexicographic(levels: Sequence[Level], units: Array | float = 1.0) -> Array 
     if missed:
         whole = _stacked(scaled[: missed + 1])
         if _holds(whole, _onto(whole, y)):
-            # DAQP violated a level that is feasible together with the more important levels.  Join these levels, and
-            # solve again.
+            # DAQP violated a level that is feasible together with the more important levels.  Join this level and the
+            # more important levels, and solve again.
             return lexicographic([_stacked(levels[: missed + 1]), *levels[missed + 1 :]], units)
     return np.asarray(units * y)
 

@@ -14,8 +14,8 @@ from impact_posture.tsid.smooth_step import smooth
 # A direction is damped if its singular value, divided by the length of the level's longest row, is smaller than this.
 # In the home postures of all shipped robots, this ratio is above 0.03.
 SINGULAR = 2e-2
-# Directions are removed if their ratio (see ``SINGULAR``) is below this fraction of ``SINGULAR``.  This fraction is
-# far above rounding errors, but too small for a visible effect.
+# Directions are removed if their ratio (see ``SINGULAR``) is below this fraction of ``SINGULAR``.  ``DROPPED`` is far
+# above rounding errors, but too small for a visible effect.
 DROPPED = 1e-9
 # Least ``1 − α``, which limits the weight ``α/(1 − α)`` of a damped row.
 LEAST = 1e-8
@@ -24,14 +24,14 @@ LEAST = 1e-8
 class LevelRank:
     """Keep the strict levels of a QP independent of each other and of the dynamics.
 
-    A level with rows ``J`` acts in the space that the more important levels leave free.  With the basis ``Z`` of this
-    space, ``J Z = U S Vᵀ``.  The rows are rotated by ``Uᵀ``, which does not change the sum of squares.  Each rotated
-    row then belongs to one singular value ``s``.  ``s₀`` is :data:`SINGULAR` times the length of the level's longest
-    row.  With ``x = s/s₀``:
+    A level with rows ``J`` acts in the space that the more important levels leave free.  ``Z`` is a basis of this
+    space, and ``J Z = U S Vᵀ``.  The rows are rotated by ``Uᵀ``, which does not change the sum of squares.  Each
+    rotated row then belongs to one singular value ``s``.  ``s₀`` is :data:`SINGULAR` times the length of the level's
+    longest row.  With ``x = s/s₀``:
 
     - ``x ≥ 1``: the row is an equation.
     - ``x = 0``: more important levels determine the row, or the row contradicts other rows of its level.  The row is
-      removed from the QP.  The other rows give the least-squares answer of the level.
+      removed from the QP.  The other rows of the level give its least-squares solution.
     - Otherwise, the row is damped: it becomes a term ``α/(1 − α) (q·ν̇ − c/s)² + x (q·ν̇)²`` of the cost, with
       ``α = x²(3 − 2x)``.  ``q = Zv`` is the row's direction of motion (not the configuration), where ``v`` is
       the column of ``V`` that belongs to ``s``.  ``c`` is the row's right-hand side.  The term is multiplied by the

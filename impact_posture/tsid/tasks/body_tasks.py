@@ -60,8 +60,8 @@ class Tilt(_BaseTurn):
         x, y, z = (state.base_rotation.T @ self.required_target()).tolist()
         sine = math.hypot(x, y)
         if sine < 1e-12:
-            # The base is aligned or upside down.  Upside down, all horizontal rotation axes are equally good, so the
-            # code selects the x axis.
+            # The z axis of the base points along the target or opposite to it.  If opposite, all perpendicular
+            # rotation axes are equally good, so the code selects the x axis.
             return np.array([0.0 if z > 0 else math.pi, 0.0])
         scale = math.atan2(sine, z) / sine
         return np.array([-scale * y, scale * x])
@@ -132,7 +132,7 @@ class BodyTaskLead:
                 task.target_velocity, task.target_acceleration = v[3:6], a[3:6]
 
     def reset(self, state: State) -> None:
-        """Set the targets that :meth:`lead` moved to the present outputs, with zero velocity and acceleration."""
+        """Set each target that :meth:`lead` changed to the present output, with zero velocity and acceleration."""
         for task in self._led:
             task.target, task.target_velocity, task.target_acceleration = None, 0.0, 0.0
             task.reset(state)

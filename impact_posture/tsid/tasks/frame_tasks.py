@@ -150,7 +150,8 @@ class FrameAligned(FrameTask[pin.SE3]):
 
     The first three rows are the rows of :class:`FramePosition`.  The last two rows are components of the shortest
     rotation from the axis to its desired direction.  The components are along two directions of the frame that are
-    orthogonal to the axis.  ``J`` selects the same two components of the frame's angular velocity.
+    orthogonal to the axis.  The last two rows of ``J`` are the components of the frame's angular velocity along the
+    same two directions.
 
     Attributes:
         target: Desired pose ``T_des``, world from frame, with its origin at the point; by default, the pose at
@@ -194,7 +195,7 @@ class FrameAligned(FrameTask[pin.SE3]):
     def select(self, here: PointState, six: Array) -> Array:
         """Return the linear rows and the two angular components orthogonal to the axis.
 
-        This also holds for accelerations, because ``d(Rᵀω)/dt = Rᵀω̇``.
+        ``six`` can also be an acceleration, because ``d(Rᵀω)/dt = Rᵀω̇``.
         """
         return np.concatenate([six[:3], self._across @ (here.rotation.T @ six[3:])])
 

@@ -163,7 +163,7 @@ class ImpactRobustPosture(JointPosture):
         self.activation.enter(Phase.BRACE)
 
     def contact(self) -> None:
-        """Make the reached posture the target during the impact, or keep the term on if the activation is live."""
+        """During the impact, hold the reached posture or, if ``activation.live``, keep the impact-robust term on."""
         self.activation.enter(Phase.CONTACT)
         self._hold = not self.activation.live
 
@@ -280,7 +280,8 @@ def curvature_scale(gradient: Gradient, model: pin.Model, q: Array, redundancy: 
         MetricError: At ``q``, the gradient does not exist, or ``H`` and its curvature are zero.
     """
     Z = redundancy if redundancy.shape[1] else np.eye(model.nv)
-    # Take the differences along the axes.  Along a basis of the redundancy, their error would depend on the basis.
+    # Take differences along the axes of ν.  Differences along a basis of the redundancy would have errors that depend
+    # on the basis.
     change = curvature(gradient, model, q, np.eye(model.nv))
     scale = max(float(np.linalg.norm(Z.T @ change @ Z, 2)), _FLAT * abs(gradient(q)[0]))
     if not (np.isfinite(scale) and scale > 0):
