@@ -166,7 +166,7 @@ def test_invalid_calls_change_nothing() -> None:
 
 def test_paths_that_do_not_fit_are_refused() -> None:
     structure = structure_of(*formulation_of("panda"))
-    with pytest.raises(InputError, match="not a path of panda"):
+    with pytest.raises(InputError, match="not have the joints of panda"):
         render_path(structure, reference_of("solo8"), "ctl")
     path = reference_of("panda", False).path
     still = type(path)(**vars(path) | {"t": path.t[:1], "q": path.q[:1], "v": path.v[:1], "a": path.a[:1]})
