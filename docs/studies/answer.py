@@ -62,7 +62,7 @@ def _rows(request: Request, programs: dict[str, str]) -> Iterator[list[str]]:
 
 
 def timed(command: list[str]) -> Run:
-    """Run a command in a new terminal.  Its output folder is temporary.
+    """Run a command in a new terminal.  The output folder of the command is temporary.
 
     The command may write Python bytecode, as it would for a user.
     """

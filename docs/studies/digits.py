@@ -22,8 +22,8 @@ from tests.support.helpers import random_configurations
 
 _CASES = ("solo8, four feet", "solo8, aside", "solo12", "bolt", "talos, two feet")
 COMPLIANCES = (1e-4, 1e-6, 1e-9)
-# Compliance that represents rigid feet.  Its bias is below rounding, and it is large enough that the rounding of J_s
-# has no effect.
+# Compliance that represents rigid feet.  The bias of this compliance is below rounding.  A smaller compliance would
+# amplify the rounding of J_s.
 _RIGID = 1e-14
 _HEAD = "robot|n|rank of $J_s$|ε m|bound|$H$ moved|oracle: H|∇H|f|kernel: H|∇H|C: H|∇H".split("|")
 

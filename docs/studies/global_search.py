@@ -27,7 +27,7 @@ _MAP = "case|degrees of freedom|components|objective|gap|word|patches|processor 
 
 
 def maps(request: Request) -> Iterator[str]:
-    """Yield the page about bounds of the objective.  Its table has a row for each case."""
+    """Yield the page about bounds of the objective.  The table of this page has a row for each case."""
     yield from _machine(request)
     yield from table(_MAP.split("|"), _maps(request))
 

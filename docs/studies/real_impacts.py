@@ -1,7 +1,8 @@
 """Compare predictions of the rigid model with simulated impacts of standing, fixed and flying robots.
 
-The prediction does not use the simulated impact.  Its inputs are the speed of the scenario, and the posture that the
-controller reaches if the robot moves exactly as planned.  Finished runs are stored in build/real-impacts.
+The prediction does not use the simulated impact.  The inputs of the prediction are the speed of the scenario, and the
+posture that the controller reaches if the robot moves exactly as planned.  Finished runs are stored in
+build/real-impacts.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ from tests.support.urdfs import stl
 
 # The box of a sole of 20 × 8 × 3 cm, whose lower face is 6 cm below the ankle.
 SOLE = np.array(list(product((-0.08, 0.12), (-0.04, 0.04), (-0.06, -0.03))))
-# The same sole, but 2 mm higher at its edge.
+# This sole with an edge that is 2 mm higher.
 UP = np.array([0.0, 0.0, 2e-3])
 TREAD = np.array(list(product((-0.079, 0.119), (-0.0396, 0.0396), (-0.06, -0.03))))
 MESH = '<collision><geometry><mesh filename="foot.stl"{}/></geometry></collision>'

@@ -112,7 +112,7 @@ def as_gpu(array: Any) -> Any:
 
 
 class Cupy:
-    """The functions of CuPy that impact_posture calls.  Its kernels are the CUDA code, compiled as C++."""
+    """The functions of CuPy that impact_posture calls.  Kernels are the CUDA code, compiled as C++."""
 
     cuda = SimpleNamespace(Device=lambda number: __import__("contextlib").nullcontext())
     library: ctypes.CDLL

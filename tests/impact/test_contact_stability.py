@@ -51,7 +51,7 @@ def test_a_sole_without_size_bears_no_moment() -> None:
 
 @pytest.mark.parametrize("name", ["solo8", "solo12"])
 def test_an_impact_from_above_presses_all_feet(name: str) -> None:
-    """Every foot impulse points up.  Their sum is less than the impulse of the impact, because the knees yield."""
+    """The foot impulses point up.  Their sum is less than the impulse of the impact, because the knees yield."""
     loaded, supports = standing(name)
     q = loaded.posture()
     result = contact_stability(oracle_of(name, (0.0, 0.0, -1.0)), supports, q)

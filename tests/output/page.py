@@ -95,7 +95,7 @@ def check_page(figure: Figure) -> None:
         for words in part.texts:
             box = words.get_window_extent()
             assert box.y0 >= part.bbox.y0 and box.y1 <= part.bbox.y1
-    # Shrink each box by one pixel, because adjacent boxes do not overlap.
+    # Boxes that only touch do not overlap, so shrink each box by one pixel.
     boxes = [axes.get_tightbbox().padded(-1) for axes in body.axes if axes.get_visible()]
     for legend in body.legends:
         box = legend.get_window_extent()

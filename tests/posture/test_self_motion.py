@@ -173,7 +173,7 @@ def test_a_batch_has_the_numbers_of_pinocchio(robot):
         assert values[k] == pytest.approx(problem.objective.value(posture), rel=1e-9)
         gradient = problem.objective.gradient(posture)
         np.testing.assert_allclose(gradients[k], gradient, atol=1e-8 * np.abs(gradient).max())
-        # Both Jacobians have the same null space.
+        # The Jacobians of the manifold and of the problem have the same null space.
         own = manifold.equalities(one[None])[1][0]
         theirs = equality_jacobian(problem, numeric.at(posture))
         free = np.linalg.svd(theirs)[2][np.linalg.matrix_rank(theirs, tol=1e-7) :]

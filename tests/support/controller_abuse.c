@@ -1,5 +1,4 @@
-/* Each command must be finite and within its limits.  This also holds for limits that permit almost nothing.  Each
-/* command must be finite and within its
+/* Run an exported controller at states that are impossible for a robot.  Each command must be finite and within its
  * limits, even if the limits permit almost nothing.  Copied contexts and contexts in threads must give equal commands.
  * The program prints the growth of memory and the statuses.  Tests build it with sanitizers or run it in valgrind.
  * Arguments: number of ticks, number of threads. */

@@ -74,7 +74,8 @@ class ExactImpact:
     """Exact quantities and gradients at one posture, for W = I and a normal in the world frame.
 
     Attributes:
-        oracle: :class:`ImpactOracle` at the posture.  It gives ``M, J, J_s, n`` and their derivatives as doubles.
+        oracle: :class:`ImpactOracle` at the posture.  The oracle gives ``M, J, J_s, n`` and their derivatives as
+            doubles.
         compliance: Compliance ε of the supports, 1/kg; may differ from the oracle's compliance.
     """
 

@@ -1,4 +1,4 @@
-"""Helpers of the mathematical tests.  They call the code under test only to load a robot."""
+"""Helpers of the mathematical tests.  These helpers call the code under test only to load a robot."""
 
 from __future__ import annotations
 

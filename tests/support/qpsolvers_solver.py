@@ -9,7 +9,7 @@ from impact_posture.tsid.qp.quadratic_program import EQUALITY, QP, Solved
 
 
 class QpsolversSolver:
-    """Solver of qpsolvers (``proxqp``, ``quadprog``, …).  It solves every QP without a warm start."""
+    """Solver of qpsolvers (``proxqp``, ``quadprog``, …).  The solver does not use warm starts."""
 
     def __init__(self, name: str, **settings: float) -> None:
         self._name, self._settings = name, settings

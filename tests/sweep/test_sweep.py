@@ -305,7 +305,7 @@ def test_neighboring_shards_share_their_optima(tmp_path: Path) -> None:
 
 
 def test_the_key_depends_on_files_of_the_robot_and_the_posture(tmp_path: Path) -> None:
-    """Neither limits nor posture files belong to the dynamics."""
+    """Limits and posture files do not affect the dynamics, but they affect the key."""
     urdf = urdfs.write(tmp_path, link("base"), link("arm", 2, "0.5 0 0"), joint("swing", "base arm", "0 0 1"))
     posture = tmp_path / "posture.json"
     text = '[problem]\nrobot = "written.urdf"\nframe = "arm"\nnormal = [0, 1, 0]\nposture = "posture.json"\n'

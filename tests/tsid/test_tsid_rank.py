@@ -109,7 +109,7 @@ def rotation(r: Robot) -> Vector:
 
 
 class Scaled(Task):
-    """Another task, expressed in another unit."""
+    """Task ``inner`` in another unit, ``factor`` times as large."""
 
     def __init__(self, inner: Task, factor: float) -> None:
         super().__init__(f"{inner.name}, scaled", inner.size, kp=inner.kp, kd=inner.kd)

@@ -1,7 +1,7 @@
 """Write the cases of the GPU study into a folder: ``python -m docs.studies.gpu.prepare FOLDER``.
 
-The folder contains exports, samples with reference values, and the programs that ``run.py`` needs.  It can be copied
-to a machine with a GPU.
+The folder contains exports, samples with reference values, and the programs that ``run.py`` needs.  The folder can be
+copied to a machine with a GPU.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Build and time the cases that ``prepare.py`` wrote: ``run.py [--build ARCHITECTURE] [--only TEXT]``.
 
-This program needs nvcc, gcc and Python without packages.  It runs in a folder that ``prepare.py`` wrote, also on a
-machine without impact-posture.  ``--build sm_90`` only builds the programs of the GPU, on a machine without a GPU.
+This program needs nvcc, gcc and Python without packages.  Run the program in a folder that ``prepare.py`` wrote, also
+on a machine without impact-posture.  ``--build sm_90`` only builds the programs of the GPU, on a machine without a
+GPU.
 """
 
 from __future__ import annotations

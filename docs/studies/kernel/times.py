@@ -1,7 +1,7 @@
 """Compare implementations of H and ∇H by time, operations, source size and compile time.
 
-All implementations use the same configurations and normals, W = I, and the robot without supports.  Their results are
-checked first.  Then C loops call the implementations alternately on one core.
+All implementations use the same configurations and normals, W = I, and the robot without supports.  The results of
+all implementations are checked first.  Then C loops call the implementations alternately on one core.
 """
 
 from __future__ import annotations

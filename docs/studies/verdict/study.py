@@ -145,7 +145,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class Row:
-    """One verdict: case, friction, stiffness, whether the feet are held, and both postures.
+    """A verdict: case, friction, stiffness, whether the feet are held, and the initial and the optimal posture.
 
     Attributes:
         feet: ``held``, ``free``, or ``–`` for a robot without feet.
