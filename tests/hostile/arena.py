@@ -23,7 +23,7 @@ from tests.support.command import PARSER
 CODES = {0, 1, 2, 3, 4, 130, 143}
 # Lines of a usage error begin with these words.
 USAGE = ("Usage: ", "Try ", "Error: ")
-# Texts that the program itself never prints, but libraries and interpreters do.
+# Texts that only libraries and interpreters print, never the program itself.
 NOISE = ("Traceback", "internal error", "Warning:", "Exception ignored", "terminate called", "Segmentation", "DEBUG")
 # Permitted processor time of an attack, s.
 BUSY = 60

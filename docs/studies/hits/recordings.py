@@ -42,8 +42,8 @@ _WEIGHT = 9.0
 _TREND = 6
 # Number of intervals that suffice for the fit.
 _ENOUGH = 3
-# Box → intervals after the contact row over which the velocity is averaged.  The light box leaves the tip after some
-# 10 ms, the heavy box after some 25 ms.
+# Box → intervals after the contact row over which the velocity is averaged.  The light box leaves the tip after about
+# 10 ms, the heavy box after about 25 ms.
 AVERAGED = {1: (2, 4), 2: (5, 7)}
 
 
@@ -214,9 +214,9 @@ def _times(values: Iterable[Any]) -> Vector:
 
 
 def contact_row(effort: Vector, command: Vector) -> int | None:
-    """Return the first row in which the contact shows; ``None`` if no row does.
+    """Return the first row in which the contact shows; ``None`` if there is no such row.
 
-    Some 45 to 60 ms after the contact, the controller brakes, and its torque on joint 1 falls at once.  The contact
+    About 45 to 60 ms after the contact, the controller brakes, and its torque on joint 1 falls at once.  The contact
     is searched in the 70 ms before the braking.  It is the first row in which the effort of a joint changes by 4 N·m,
     and by 5 N·m within two rows.  Joint 2 does not count, because its large effort is noisy.  In the 24 windows with
     braking, the row differs by at most one from the row that their authors state.
