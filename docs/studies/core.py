@@ -63,8 +63,8 @@ STUDIES = {
     study.name: study
     for study in (
         Study("solve", "solve", "solve and build times, and the exported gradient with feet; random starts", 20),
-        Study("answer", "answer", "time of optimize until answer and end, also of another version", 5, page=False),
-        Study("formulations", "formulations", "the linear solve inside the program or its objective", 12, page=False),
+        Study("answer", "answer", "time of optimize until answer and end, or of another version", 5, page=False),
+        Study("formulations", "formulations", "impact equations as constraints or in the objective", 12, page=False),
         Study("kernel", "kernel.times", "H and ∇H: our code, Pinocchio C++, ADAM and CasADi; passes", 101),
         Study("gpu", "gpu.study", "H and ∇H on a GPU, on all cores, in PyTorch and in frax"),
         Study("loader", "exported:loader", "a call of exported code from Python; passes", 100, page=False),

@@ -38,7 +38,7 @@ from impact_posture.system.libraries import cache_folder
 _ARMS = 76
 # The constants of the search were chosen with the first arms up to this number, and not with the others.
 _TUNED = 60
-# Number of independent starts for the best known objective of a case.
+# Number of additional starts, which determine the best known objective of a case.
 _MANY = 1024
 # Seed of these starts.
 _OTHER_SEED = 1000

@@ -98,7 +98,7 @@ def struck(case: str, name: str, seed: int, offline: Callable[..., OfflinePostur
 def results(case: str, name: str, seeds: range) -> list[dict[str, Any]]:
     """Return the results of all seeds.
 
-    The spread does not affect the optimum, which is computed once, except the height of a robot that falls.
+    The optimum is computed once, because it does not depend on the spread, except in a fall, whose height varies.
     """
     first: list[OfflinePosture] = []
 

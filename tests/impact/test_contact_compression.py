@@ -308,7 +308,9 @@ def test_bounds_that_cannot_be_met_name_their_rows_and_units() -> None:
 
 
 def test_edges_of_speed_and_of_locked_joints(tmp_path: Path) -> None:
-    """At zero speed, a material has no compression time; with all joints locked, no joint jump can be bounded."""
+    """At zero speed, no compression time exists for a material.  With all joints locked, no joint jump can be
+    bounded.
+    """
     still = ("evaluate", "panda", "--normal", 0, 0, 1, "--speed", 0, "--contact-stiffness", "steel", "--json")
     done = json.loads(run(*still).stdout)["evaluation"]["compression"]
     assert done["compression_time"] is None and done["peak_force"] == 0 and done["x"] is None

@@ -105,7 +105,7 @@ def fastest(posed: Prepared, q: Vector) -> float:
     low, high = -limit, limit
     if wanted.strike:
         room = np.maximum(model.upperPositionLimit - q, 0), np.maximum(q - model.lowerPositionLimit, 0)
-        # A floating base does not move.
+        # During the approach, a floating base does not move.
         count = nv - 6 if robot.floating else nv
         still, joints = np.zeros(nv - count), slice(model.nq - count, None)
         ahead, behind = (np.append(still, side[joints] / _ROOM) for side in room)

@@ -336,7 +336,7 @@ def _touched(problem: ConstrainedProblem, q: np.ndarray, tilt: float, shift: flo
     contacts, data = problem.objective.contacts, model.createData()
     points = [point_on(problem.robot, contact.frame, contact.offset) for contact in contacts]
     pin.forwardKinematics(model, data, q)
-    # The tip turns with the last link, so both may touch the surface.
+    # The tip turns with the last link, so the link may touch the surface too.
     struck = {point.joint for point in points}
     shapes = [shape for shape in around.shapes.geometry.geometryObjects if shape.parentJoint not in struck]
     for (contact, point), heading in product(zip(contacts, points, strict=True), np.arange(16) * np.pi / 8):

@@ -172,7 +172,7 @@ FLOOR = Surface("floor", (0, 0, 1), (0, 0, 0))
 
 @pytest.mark.parametrize("frame", ["foot_fl", "trunk"])
 def test_links_without_shapes_touch_surfaces(tmp_path: Path, frame: str) -> None:
-    """A quadruped falls 5 mm onto its trunk.  Only a shape at the trunk counts the contact of the trunk."""
+    """A quadruped falls 5 mm onto its trunk.  The impulse is recorded only for a shape at the trunk."""
     robot = loaded(tmp_path, QUADRUPED)
     q = robot.posture()
     q[2:7], q[7:] = [0.055, 0, 0, 0, 1], np.tile([0.0, -1.5, 1.5], 4)

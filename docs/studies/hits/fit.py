@@ -1,4 +1,4 @@
-"""Fit what is not published about the arm, and summarize the measured jumps of a group of hits."""
+"""Fit the unpublished parameters of the arm, and summarize the measured jumps of a group of hits."""
 
 from __future__ import annotations
 

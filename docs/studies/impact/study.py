@@ -52,7 +52,7 @@ VARIATIONS = (
 def needed_friction(predicted: ImpactQuantities) -> float:
     """Return the smallest friction coefficient for which the contact point sticks.
 
-    It is the tangential part of the impulse of a sticking contact, divided by the normal part.
+    The coefficient is the tangential part of the impulse of a sticking contact, divided by the normal part.
     """
     s, n = predicted.sticking_impulse, predicted.normal
     return float("nan") if s is None else float(np.linalg.norm(s - (n @ s) * n) / (n @ s))
