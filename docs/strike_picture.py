@@ -1,4 +1,4 @@
-"""Draw simulated contacts of an aerial manipulator, planned and not, for README.  Run with ``make pictures``."""
+"""Draw a planned and an unplanned contact of an aerial manipulator, for README.  Run with ``make pictures``."""
 
 from __future__ import annotations
 

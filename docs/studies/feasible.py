@@ -27,7 +27,7 @@ class Cost(NamedTuple):
 
     Attributes:
         solutions: Solution of the search with each seed.
-        start: Median time of a start, divided by the median in an unconstrained search just before; median over the
+        start: Median time of a start, divided by its value in an unconstrained search just before; median over the
             seeds.
         search: Time of the whole search, divided by the time of the unconstrained search; median over the seeds.
         took: Time of the search with the first seed, s.

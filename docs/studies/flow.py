@@ -69,7 +69,7 @@ class Outcome:
 
     Attributes:
         course: Course of the flow.
-        optimum: ``H`` at the local optimum, under the same constraints.
+        optimum: ``H`` at the local optimum, under the constraints of the flow.
         q: Posture at the local optimum.
         program: True if the offline program, started at the end of the flow, computed this optimum; false if a flow
             with smaller steps computed it.

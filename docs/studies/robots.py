@@ -191,9 +191,10 @@ def _start_from(config: Path, name: str, robot: Robot, joints: dict[str, float])
 
 
 def natural_normal(robot: Robot) -> tuple[float, ...]:
-    """Return the normal: up for a foot, backwards for a base (a wall ahead), and else against the last link.
+    """Return the normal: up for a foot, backwards for a base (a wall ahead), and otherwise opposite to the last link.
 
-    The last link reaches from its joint, or from the next joint that is far enough away, to the contact point.
+    The last link points from its joint to the contact point.  If this joint is too near, an earlier joint replaces
+    it.
     """
     frame, model, data = str(robot.spec.contact.frame), robot.model, robot.model.createData()
     if frame in [support.frame for support in robot.spec.supports]:

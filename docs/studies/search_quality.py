@@ -59,7 +59,7 @@ class _Case(NamedTuple):
 
 
 class Run(NamedTuple):
-    """Run of both searches: objective and processor time, s, of each."""
+    """Objective and processor time, s, of the default search and of multi-start in one run."""
 
     case: str
     groups: tuple[str, ...]

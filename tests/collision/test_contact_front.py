@@ -74,7 +74,7 @@ SHAPES = {
 @pytest.mark.parametrize("kind", SHAPES)
 @pytest.mark.parametrize("direction", [(1, 0, 0), (0, 0, 1), (0, 0, -1), (0.6, 0, 0.8), tuple(TILTED)])
 def test_the_front_of_a_round_or_flat_shape_is_exact(kind: str, direction: tuple[float, ...], tmp_path: Path) -> None:
-    """The height is the support function of the shape; the point itself lies on the shape."""
+    """The reach of the front is the support function of the shape, and the front point lies on the shape."""
     rpy = "0.4 -0.7 1.1"
     robot = written(tmp_path, link("hand", "base", shape(SHAPES[kind], "0.3 -0.1 0.2", rpy)))
     d, center = np.array(direction), np.array([0.3, -0.1, 0.2])
@@ -137,7 +137,7 @@ def test_the_warning_names_the_distance_and_an_option_that_mends_it(tmp_path: Pa
     for mended in ({"offset": (0, 0, 0.25)}, {"contact_point": "front"}):
         lines, offset = resolved(path, normal=n, **mended)
         assert not lines and offset == pytest.approx((0, 0, 0.25), abs=1e-9)
-    # A normal in the axes of the frame has the same front.
+    # A normal in the axes of the contact frame gives the same front.
     assert resolved(path, normal=(0, 0, -1), normal_frame="contact", contact_point="front")[1] == pytest.approx(
         offset
     )

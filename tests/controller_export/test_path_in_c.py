@@ -78,7 +78,7 @@ def phases(
     n: int = 700,
     strikes: bool = True,
 ) -> dict[int, PathPhase]:
-    """Make the same calls of Python and C at the same ticks, and compare the references of all ticks.
+    """Make the same calls in Python and in C at the same ticks, and compare the references of all ticks.
 
     The robot is not at its reference, and has 30 % of the velocity of the reference.  Return the ticks at which a
     phase begins.

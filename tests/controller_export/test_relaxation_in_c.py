@@ -170,7 +170,7 @@ def test_without_levels_or_rows(relaxation: Relaxation) -> None:
 
 
 def test_a_budget_is_kept(relaxation: Relaxation) -> None:
-    """With too few iterations, the result is an error code.  The next tick starts from these active rows."""
+    """With too few iterations, the result is an error code.  The next solve starts from the last active rows."""
     tick = ticks_of("talos", "legged")[-1]
     relaxation.forget()
     needed = relaxation.solve(tick).iterations

@@ -32,7 +32,7 @@ def on_springs(loaded: Robot, table: TransmissionSpec) -> Robot:
 
 
 def springs(stiffness: float, damping: float = 0.0, **joints: JointTransmissionSpec) -> TransmissionSpec:
-    """Return springs for all joints except ``joints``."""
+    """Return springs for all joints; ``joints`` states other transmissions."""
     return TransmissionSpec("elastic", stiffness, damping, joints)
 
 

@@ -244,7 +244,7 @@ def test_subgradients_at_a_mirror_symmetric_posture(name: str, frames: tuple[str
         # The rise of the objective is the largest slope, as for a maximum of smooth functions.
         assert rise == pytest.approx(slopes.max(), rel=1e-3, abs=1e-3 * objective.value(q))
         assert slopes.min() < rise + 1e-3 * objective.value(q)
-    # The symbolic gradient is the gradient of one of the tied corners.
+    # The symbolic gradient is the gradient of one of the equally bad corners.
     value, gradient = (np.array(v).ravel() for v in objective.gradient_fun()(q, one.normal))
     assert value[0] == pytest.approx(objective.value(q), rel=1e-9)
     assert min(relative(gradient, g) for g in points.gradients) < 1e-6

@@ -208,7 +208,7 @@ def test_a_robot_without_gravity_does_not_fall() -> None:
 
 
 def test_a_robot_that_cannot_stand_on_its_contacts_does_not_stop() -> None:
-    """On two point feet, nothing resists a rotation about the line through both."""
+    """On two point feet, nothing resists a rotation about the line through the feet."""
     task = {
         "robot": "solo12", "contact": ("FL_FOOT:0,0,1", "HR_FOOT:0,0,1"), "contact_pose": "position", "normal": None,
         "support": (), "base": "level", "limit_margin": 0.5,

@@ -145,7 +145,7 @@ def test_velocities_that_leave_an_active_bound_are_preferred() -> None:
     solution, path = struck("panda")
     at, worst = path.q[-1], int(np.abs(path.v[-1]).argmax())
     sign, lower, upper = np.sign(path.v[-1][worst]), solution.problem.lower.copy(), solution.problem.upper.copy()
-    # The run-up begins at q − t ν, and this limit forbids this posture.
+    # The run-up begins at q − t ν, and the new limit forbids this posture.
     (lower if sign > 0 else upper)[worst] = at[worst]
     blocked = replace(solution.problem, lower=lower, upper=upper)
     velocity = impact_velocity(StrikeSpaces(blocked, at), at, SPEED, 0.05, inside=True)
@@ -306,7 +306,7 @@ def test_the_stop_after_the_impact_starts_at_the_predicted_velocity(name: str) -
 
 @pytest.mark.parametrize(("effort", "cone"), [(8.0, 0.0), (8.0, 10.0), (5.0, 0.0)])
 def test_a_cart_stops_before_the_end_of_its_slide_or_says_why(tmp_path: Path, effort: float, cone: float) -> None:
-    """The worst impact has 120 % of 1 m/s and restitution 0.5.  Its stop takes T = 3/2 v m/F over v T/2."""
+    """The worst impact has 120 % of 1 m/s and restitution 0.5.  The stop takes T = 3/2 v m/F over v T/2."""
     problem = slider(tmp_path, effort, 9.0, cone).problem
     limits = ActuatorLimits(problem.objective, problem.given, problem.requirements)
     after = follow_through(problem, problem.given, np.array([1.0]), 0.25, limits)

@@ -18,7 +18,7 @@ TASK = ("--normal", -1, 0, 0, "--starts", 2, "--jobs", 1, "--no-codegen", "--for
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The result of a contact at the front of the last link of ur5, whose side faces the surface."""
+    """The result of a contact at the front of the last link of ur5.  The side of this link faces the surface."""
     here = tmp_path_factory.mktemp("front")
     done = succeed("optimize", "ur5", *TASK, "--contact-point", "front", "--out", "front", cwd=here)
     assert "a flat surface touches" not in done.stderr + done.stdout

@@ -121,7 +121,7 @@ def test_fingers_that_move_are_kept_apart(tmp_path: Path) -> None:
 
 
 def test_parts_of_a_telescope_may_overlap(tmp_path: Path) -> None:
-    """Three slides along x; a slide along y is not a telescope, and its pairs stay."""
+    """Three slides along x form a telescope.  A slide along y does not, so its pairs are still checked."""
     slide = MOVED.replace("-2.5", "0").replace("2.5", "0.25")
     sizes = (0.09, 0.07, 0.05, 0.03)
     links = [link(f"boom{k}", 1, "0.2 0 0", box=f"0.3 {w} {w}") for k, w in enumerate(sizes)]

@@ -19,7 +19,7 @@ def test_a_tool_ends_at_its_contact_point_and_a_base_is_warned_about(name: str) 
     for frame, axis in FORWARD.get(name, {}).items():
         measured = front(loaded, frame, axis)
         assert abs(measured.reach) < BEYOND
-        # The contact point is near the middle of the front, not only at its height.
+        # The contact point has the height of the front, and is near the middle of the front.
         assert np.linalg.norm(np.subtract(measured.offset, loaded.spec.contact.offset_of(frame))) < BEYOND
     if name in FORWARD:
         assert loaded.spec.contact.frame in FORWARD[name]

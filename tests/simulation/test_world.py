@@ -232,7 +232,7 @@ def test_a_shape_has_the_friction_of_each_surface() -> None:
     world.step(ActuatorCommand(NONE, NONE), 100)
     (shape,) = world.truth().shapes
     assert shape.impulse[0] < -1 and shape.impulse[2] > 0
-    # Only the wall has friction, so the tangential force stays below its friction limit.
+    # Only the wall has friction, so the tangential force stays below the friction limit of the wall.
     assert -0.5 * abs(shape.impulse[0]) * (1 + 1e-9) <= shape.impulse[1] < -0.05
 
 

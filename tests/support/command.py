@@ -137,7 +137,7 @@ def start(
     prepare: Callable[[], None] | None = None,
     pictures: Collection[str] = (),
 ) -> BaseProcess:
-    """Start a command for :func:`run`, with standard output and standard error on these descriptors."""
+    """Start a command for :func:`run`, with ``out`` and ``errors`` as standard output and standard error."""
     words = [str(argument) for argument in arguments]
     variables = {"COLUMNS": "80", "NO_COLOR": "1", "BROWSER": "true", **(env or {})}
     target = words, cwd, variables, prepare, out, errors, pictures

@@ -210,7 +210,7 @@ def test_the_zero_moment_point_stays_within_the_feet(monkeypatch: pytest.MonkeyP
     data, none = r.model.createData(), np.zeros(r.nv)
 
     def least_room() -> float:
-        """Return the smallest distance from the point to an edge of the support polygon, m."""
+        """Return the smallest distance from the zero moment point to an edge of the support polygon, m."""
         flow = flow_of(r, well(r, goal_of(r, "feet", 2.0)), acceleration=10.0)
         ground = flow._state.at(flow._contacts[0].point).position[2]
         flow.on, least = True, np.inf

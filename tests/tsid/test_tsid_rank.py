@@ -299,9 +299,7 @@ def wrist() -> tuple[Robot, TaskFormulation]:
 
 
 def flying() -> tuple[Robot, TaskFormulation]:
-    """The second hinge rolls the tip.  The second hinge rolls the tip.  If the first link is vertical, the second
-    hinge and the base yaw the tip.
-    """
+    """The second hinge rolls the tip.  If the first link is vertical, the second hinge and the base yaw the tip."""
     r = arm([Y, Z, Y], [0.3, 0.4, -0.2], floating=True)
     return r, aerial_formulation(r, JointPosture(r), law=None)
 

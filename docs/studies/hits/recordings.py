@@ -217,9 +217,10 @@ def contact_row(effort: Vector, command: Vector) -> int | None:
     """Return the first row in which the contact shows; ``None`` if there is no such row.
 
     About 45 to 60 ms after the contact, the controller brakes, and its torque on joint 1 falls at once.  The contact
-    is searched in the 70 ms before the braking.  It is the first row in which the effort of a joint changes by 4 N·m,
-    and by 5 N·m within two rows.  Joint 2 does not count, because its large effort is noisy.  In the 24 windows with
-    braking, the row differs by at most one from the row that their authors state.
+    is searched in the 70 ms before the braking.  The contact row is the first row in which the effort of a joint
+    changes by 4 N·m, and by 5 N·m within two rows.  Joint 2 does not count, because its large effort is noisy.  In
+    the 24 windows with braking, this row differs by at most one from the row that the authors of the recordings
+    state.
     """
     if len(effort) < _BRAKED:
         return None

@@ -106,7 +106,7 @@ class Evaluation:
         mass.
 
         The measured torques and the momentum of the links determine the impulse without controller, restitution and
-        mass of the box: ``M Δq̇ − ∫Δτ dt = −(j p + moments)``.  The inertia of links and rotors only weighs the least
+        mass of the box: ``M Δq̇ − ∫Δτ dt = −(j p + moments)``.  The inertia of links and rotors weights the least
         squares.  For a box of the returned mass, kg, ``reflected`` predicts this impulse.  Impulses are in N·s.
         """
         measured, fitted = self.measured[group], self.fit.models["reflected"]

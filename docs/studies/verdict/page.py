@@ -125,7 +125,7 @@ def _beyond_row(row: Row, name: str, pair: Pair, number: str, reason: str) -> li
 
 
 def _counts(rows: Sequence[Row], request: Request) -> Iterator[str]:
-    """Yield how many numbers are within each bar, signs, sticking, and feet."""
+    """Yield how many numbers are within their bar, and how often signs, sticking and feet are predicted correctly."""
     known = [number for number in NUMBERS if any(row.changes(number) for row in rows)]
     yield from table(_COUNTS, [_count(number, rows, request) for number in known])
     pairs = [pair for _, _, pair in _pairs(rows)]
@@ -210,7 +210,7 @@ def _count(number: str, rows: Sequence[Row], request: Request) -> list[str]:
 
 
 def _signed(row: Row, number: str, change: tuple[float, float]) -> bool:
-    """Return whether a number changes by more than 3 %, and a velocity by more than is negligible."""
+    """Return whether a number changes by more than 3 %, and a velocity also by more than a negligible amount."""
     if max(map(abs, change)) <= NO_CHANGE:
         return False
     first, last = row.before.values(number), row.after.values(number)
