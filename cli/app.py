@@ -1,4 +1,4 @@
-"""Typer app with the subcommands of ``impact-posture``.  It imports only the module of the called subcommand."""
+"""Typer app with the subcommands of ``impact-posture``.  Only the module of the called subcommand is imported."""
 
 from __future__ import annotations
 

@@ -70,8 +70,6 @@ def run(command: Any, arguments: Sequence[str]) -> int:
 
 @dataclass(frozen=True)
 class _Fault:
-    """Exit code and message of an error."""
-
     code: int
     kind: str
     what: str

@@ -73,7 +73,6 @@ def rows_table(page: Page, rows: tuple[ControllerRow, ...] | list[ControllerRow]
 
 
 def _loads_table(page: Page, rows: tuple[ControllerRow, ...] | list[ControllerRow]) -> None:
-    """Write a table of the effects on base, joints and contact, with one row per controller."""
     from impact_posture.experiment.reproduction_summary import joint_text
     from impact_posture.simulation.metrics import AFTER_TOUCH
 

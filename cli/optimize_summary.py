@@ -101,7 +101,6 @@ def summarize(page: Page, prepared: Prepared, solution: PostureSolution, documen
 
 
 def _certificate(page: Page, solution: PostureSolution, collision: dict[str, Any] | None) -> None:
-    """Print the numbers of the certificate and the smallest distance between bodies."""
     certificate = solution.certificate
     page.line(
         f"certificate ({certificate.recomputed_with}): stationarity {certificate.stationarity:.1e}, "

@@ -67,8 +67,8 @@ def with_settings(
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Return a decorator that adds an option for each setting to a command.
 
-    Settings in ``without`` get no option.  ``changed`` maps the name of a setting to a different annotation of its
-    option.  The command is called with ``typed`` (:class:`TypedSettings`) and its own parameters.
+    Settings in ``without`` get no option.  ``changed`` replaces annotations of options: name of a setting →
+    annotation.  The command is called with ``typed`` (:class:`TypedSettings`) and its own parameters.
     """
     options = _options(settings, without) | {name: (hint, None) for name, hint in changed.items()}
     if "support" in options:

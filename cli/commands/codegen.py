@@ -1,7 +1,7 @@
 """``impact-posture codegen ROBOT --frame F --normal X Y Z`` or ``impact-posture codegen RESULT_DIR``.
 
 With ``--controller KIND``, the command writes the complete online controller instead of the metric alone.  From a
-result with a path, it also writes the references along the path.
+result with a path, the command also writes the references along the path.
 """
 
 from __future__ import annotations
@@ -109,8 +109,8 @@ def codegen(
 def _check_problem(typed: TypedSettings, robot: str) -> None:
     """Check that a contact is given.
 
-    If no contact is given and ``robot`` is a folder, the user probably means a result folder.  The error then states
-    why the folder is not a result.
+    If no contact is given and ``robot`` is a folder, the user probably means a result folder, so the error states why
+    the folder is not a result.
     """
     if not {"contact", "normal"} & typed.values.keys() and (os.path.isdir(robot) or robot.endswith(os.sep)):
         from impact_posture.output.result_reader import load_view

@@ -78,7 +78,6 @@ def verify(
 
 
 def _of_result(folder: Path) -> ResolvedImpact:
-    """Return the impact of a result folder, at the posture of its posture.json."""
     from impact_posture.impact.resolved_impact import ResolvedImpact
     from impact_posture.output.result_reader import load_view
 

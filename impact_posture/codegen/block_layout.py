@@ -35,9 +35,8 @@ class Layout:
     Attributes:
         blocks: The blocks in the order in which they are called.
         inlined: Nodes that are computed inside the statement of the only operation that uses them.
-        slots: Node that a later block uses → index of the node's value in the work array.  Each width has a work
-            array.
-        sizes: Width → length of the work array for values of this width.
+        slots: Node that a later block uses → index of the node's value in the work array.
+        sizes: Width (number of lanes of a vector) → length of the work array for values of this width.
         angles: Input nodes whose sine and cosine are computed, in the order of the arrays of sines and cosines.
         trig: Sine or cosine node → index of its first value in the array of sines or cosines.
         leaves: Nodes that need no statement: constants, inputs, lanes, and sines and cosines of inputs.

@@ -21,7 +21,8 @@ _PLACE = 7
 SHORT_NAMES = ("APART", "K", "K2", "K4", "V2", "V2u", "V4", "V4u", "VN")
 """Names of the macros that the generated C file defines, and undefines at its end."""
 
-# Arrays that can be parameters of a block in addition to the inputs: sines, cosines, and work arrays by width.
+# Arrays that can be parameters of a block in addition to the inputs: sines, cosines, and a work array for each vector
+# width.
 _SHARED = ("s", "c", "w", "w2", "w4")
 # A compiler splits vectors that are wider than the vectors of the processor.  Without optimization, the compiler
 # stores the whole vector and its parts, which takes twice the stack.
@@ -63,7 +64,7 @@ class Constants:
         return f"{_short(node.width)}[{known.setdefault(node.value, len(known))}]"
 
     def text(self, types: Mapping[int, str]) -> str:
-        """Return the C definitions of the tables and of their short names.  ``types`` maps a width to its C type."""
+        """Return the C definitions of the tables and of their short names; ``types`` maps vector width → C type."""
         lines = []
         for width, known in sorted(self._tables.items()):
             rows = [", ".join(self._real.plain(v) for v in value) for value in known]
@@ -83,8 +84,8 @@ def _short(width: int) -> str:
 class Emitter:
     """C code of the blocks of one layout.
 
-    The names of blocks begin with ``prefix``.  ``types`` maps a width to its C type.  ``size`` is the size in bytes
-    of the type for a single value (width 1); by default, the size of ``real``.  ``work`` is the name of the C
+    The names of blocks begin with ``prefix``.  ``types`` maps a vector width to its C type.  ``size`` is the size in
+    bytes of the type for a single value (width 1); by default, the size of ``real``.  ``work`` is the name of the C
     structure with inputs and work arrays.  ``work`` is empty if the inputs are separate arguments.
     """
 

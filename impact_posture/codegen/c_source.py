@@ -185,7 +185,6 @@ def _cuda(
 def _variables(
     function: Exported, emitter: Emitter, calls: Sequence[str], normals: Mapping[str, Sequence[float]]
 ) -> dict[str, Any]:
-    """Return the template variables of a function that computes one configuration."""
     inputs, results = SIGNATURES[function.name]
     sizes = [len(emitter.layout.graph.outputs[output]) for output in function.outputs]
     return {
@@ -216,7 +215,6 @@ def _lanes(function: Exported, scalars: Graph, real: Real, constants: Constants)
 
 
 def _angles(layout: Layout) -> tuple[int, ...]:
-    """Return the index in ``q`` of each angle of a layout."""
     return tuple(layout.graph.nodes[k].args[1] for k in layout.angles)
 
 

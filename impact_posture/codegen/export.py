@@ -161,8 +161,8 @@ def export(
     if posture is not None:
         stated = np.array(posture, dtype=float)
         posture = robot.check_posture(stated, limits=False)
-        # Keep the digits of ``posture``, because normalization can change the last digits of a normalized posture.
-        # The code then contains the same numbers as result.json.
+        # Keep the digits of ``posture``, so that the code contains the same numbers as result.json.  Normalization
+        # can change the last digits of a normalized posture.
         posture = stated if np.allclose(stated, posture, rtol=0, atol=1e-9) else posture
     exported, code = cached_code(tuple(objectives), prefix, real, portable, cuda)
     manifest = build_manifest(

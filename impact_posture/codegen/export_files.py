@@ -201,7 +201,6 @@ def _frame(v: NamedObjective, test: dict[str, Any], alone: bool) -> dict[str, An
 
 
 def _worst_note(objective: WorstCaseObjective) -> str:
-    """Return a note for the header about model variants, non-unique gradients, and friction."""
     note = ""
     if objective.model_variants:
         note = "; the worst of " + "; ".join(model.name for model in objective.model_variants)
@@ -213,7 +212,6 @@ def _worst_note(objective: WorstCaseObjective) -> str:
 
 
 def _several(joint: NamedObjective, test: dict[str, Any]) -> dict[str, Any]:
-    """Return the template variables for the objective of several contacts at once."""
     objective = joint.objective
     names, bounded = [f"({model.name})" for model in objective.model_variants], objective.impact_kind.adds_up
     box = "|impulse| up to" if objective.bilateral else "impulses from 0 to"

@@ -35,10 +35,9 @@ _LEAST_ROWS = 256
 class ImpactGradient:
     """Compute ``H``, its tangent gradient and related quantities with a compiled export.
 
-    Every method copies its inputs into buffers that were allocated once.  **Array results are views of buffers.  The
-    next call of the same method overwrites them.**  Copy a result if you need it after the next call.  Use an
-    object in one thread only; :meth:`copy` returns an object for another thread.  Calls release the global
-    interpreter lock.
+    Every method copies its inputs into buffers that were allocated once.  **Array results are views of buffers, which
+    the next call of the same method overwrites.**  Copy a result if you need it after the next call.  Use an object
+    in one thread only; :meth:`copy` returns an object for another thread.  Calls release the global interpreter lock.
 
     The methods for a single configuration raise these errors:
 

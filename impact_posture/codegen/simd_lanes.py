@@ -99,8 +99,8 @@ def _place(
 ) -> tuple[Key, tuple[int, int]] | None:
     """Return the key of a node, and its group and lane.
 
-    Return ``None`` if the node cannot be in a vector.  Either its operands are in no lane or in several lanes, or C
-    cannot apply the operation to vectors.
+    Return ``None`` if the node cannot be in a vector, because its operands are in no lane or in several lanes, or
+    because C cannot apply the operation to vectors.
     """
     node = graph.nodes[k]
     if k in places:

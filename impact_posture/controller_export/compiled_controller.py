@@ -290,7 +290,7 @@ class CompiledController:
             self._enter("brace_before", t, t_impact)
 
     def contact(self, t: float = -math.inf) -> None:
-        """Hold the reached posture during the impact, or keep the impact-robust term on if its activation is live.
+        """Hold the reached posture during the impact, or, if ``activation.live``, keep the impact-robust term on.
 
         ``t`` has the same meaning as in :meth:`brace`.
         """

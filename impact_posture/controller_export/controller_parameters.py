@@ -29,7 +29,7 @@ _FLOW: tuple[tuple[str, Rule, str], ...] = (
     ("rho", "nonnegative", "weight of the squared distance from the start, 1/rad2"),
     ("mu", "amount", "smaller curvatures are raised to this value, 1/rad2"),
     ("epsilon", "amount", "predicted decrease of H/H0 below which the flow rests"),
-    ("duration", "amount", "longest time of motion after a brace, not counting a path or rest, s"),
+    ("duration", "amount", "longest motion after each brace, without the time on a path or at rest, s"),
     ("joint_margin", "nonnegative", "distance from the joint limits, rad or m"),
     ("com_margin", "nonnegative", "distance of the center of mass from the edges of the support polygon, m"),
     ("tilt", "amount", "largest tilt of the base from the default posture, rad"),

@@ -231,7 +231,7 @@ def _files(sizes: dict[str, int]) -> list[str]:
 
 
 def _room(sizes: dict[str, int]) -> dict[str, int]:
-    """Return the lengths of the arrays in the C code, at least 1, by the names of the sizes and of further arrays."""
+    """Return name → length of the arrays in the C code, at least 1: the ``sizes``, and further arrays."""
     nv, equations, levels = sizes["NV"], sizes["EQUATIONS"], 1 + sizes["LEVELS"]
     n, held, rows = sizes["VARIABLES"], sizes["HELD"], sizes["FLOW_ROWS"]
     more = {
@@ -245,7 +245,6 @@ def _room(sizes: dict[str, int]) -> dict[str, int]:
 
 
 def _solver_stack(sizes: dict[str, int]) -> int:
-    """Return the stack bytes of the solver of a QP and of the function that calls the solver."""
     n, bounds = sizes["VARIABLES"] + 1, max(sizes["SIMPLE"] + sizes["GENERAL"], 2 * sizes["FLOW_ROWS"])
     return 8 * (n * (n + 1) // 2 + 12 * n + 2 * bounds + 16 * sizes["NV"]) + 2048
 

@@ -224,8 +224,6 @@ def _is_diagonal_in_momentum(robot: Robot, formulation: TaskFormulation) -> bool
 
 
 def _check(robot: Robot, formulation: TaskFormulation) -> None:
-    """Raise :class:`InputError` if a task, a limit or a joint has no C code."""
-
     def refuse(what: str) -> InputError:
         return InputError(what, where="controller export", hint="run it in Python, or use tasks of this package")
 

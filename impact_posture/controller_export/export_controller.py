@@ -162,7 +162,6 @@ def _metric(objective: WorstCaseObjective, prefix: str) -> dict[str, str]:
 
 
 def _manifest(s: Structure, fields: Sequence[Field], prefix: str) -> dict[str, Any]:
-    """Return the manifest, which contains the sizes of all buffers and the names of their entries."""
     robot = s.robot
     return {
         "schema": SCHEMA,

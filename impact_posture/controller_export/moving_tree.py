@@ -85,6 +85,6 @@ class MovingTree(Tree):
             start = accelerations[parent] if parent else ca.vertcat(-self._gravity, ca.SX(3, 1))
             accelerations[i] = motion_to_child(self._R[i], self._p[i], start)
             if parent:
-                # For joints without a parent, the product is zero, because the link velocity is S ν itself.
+                # Without a parent, this product is zero, because the link velocity is S ν itself.
                 accelerations[i] += motion_cross(self._moving[i], self._S[i] @ self._v[slot.v])
         return accelerations

@@ -28,7 +28,7 @@ from impact_posture.system.text_files import read_bytes, read_text
 Progress = Callable[[int, int], None]
 # Pattern of the names of stored files, and of incomplete files that a killed process leaves.
 _STORED = re.compile(r"\.?[0-9a-f]{64}(\.minus)?\.(json|npz)(\.\d+\.part)?")
-# Errors that occur if a document has another structure.
+# Errors that occur if a document does not have the expected structure.
 _BROKEN = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError)
 
 
@@ -77,7 +77,7 @@ class JobStore:
             self.folder.rmdir()
 
     def remove(self) -> None:
-        """Remove the stored files.  Then remove the folder if it is empty."""
+        """Remove the stored files, and the folder if it is empty afterwards."""
         with suppress(OSError):
             for path in self.folder.iterdir():
                 if _STORED.fullmatch(path.name):

@@ -36,8 +36,8 @@ class PaperRow:
     reduction: float
 
 
-# Rows of the paper.  Only their reductions can be compared with this package, because the shipped scenarios have
-# other robots, gains and contact models.  Also, the measurement windows of the paper end with the contact.
+# Rows of the paper.  Only the reductions can be compared with this package: the paper has other robots, gains and
+# contact models, and its measurement windows end with the contact.
 PAPER: dict[str, PaperRow] = {
     "aerial-vertical": PaperRow(10.4, 5.1, 0.51),
     "aerial-lateral": PaperRow(9.2, 5.5, 0.402),

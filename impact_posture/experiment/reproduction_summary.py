@@ -248,7 +248,6 @@ def targets_text(row: ControllerRow) -> str:
 
 
 def _missed(row: ControllerRow) -> str:
-    """Return descriptions of the targets that a row misses, such as "a joint on its stop"."""
     return ", ".join((missed_targets(row) or {}).values())
 
 

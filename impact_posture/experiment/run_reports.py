@@ -127,8 +127,8 @@ def write_run_report(folder: Path, scenario: str = "", *, meshes: bool = False, 
 def thin(series: Series, windows: Iterable[Window]) -> Series:
     """Return the time series of a run with fewer ticks, for the report.
 
-    The ticks are denser within impact windows, and end when the state diverges.  Force and peak force at a remaining
-    tick are the largest values since the previous remaining tick.
+    The ticks are denser within impact windows, and end when the state diverges.  Force and peak force at a kept tick
+    are the largest values since the previous kept tick.
 
     Raises:
         InputError: The state diverges within two ticks.
@@ -208,7 +208,6 @@ def _job(document: Document, scenario: str) -> Job:
 
 
 def _runs(document: Document, stem: Path, scenario: str, count: int) -> list[tuple[RunView, WorstCaseObjective]]:
-    """Return view and objective of the first ``count`` runs of a document."""
     job, runs = _job(document, scenario), []
     factory = controller_factory(job.scenario, job.free, job.seed)
     if document["model_sha256"] != factory.setup.robot.model_sha256:

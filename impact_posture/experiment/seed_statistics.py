@@ -184,7 +184,7 @@ def row_of(
     good = [d for d in documents if d["status"] == "completed"]
     base = {d["seed"]: d for d in nominal}
     pairs = [(d, base[d["seed"]]) for d in documents if d["seed"] in base]
-    # If a run failed, compare no runs, because the remaining runs are not a representative sample.
+    # If a run failed, compare no runs, because the completed runs alone are not a representative sample.
     fair = bool(pairs) and len(good) == len(documents) and all(n["status"] == "completed" for _, n in pairs)
 
     def paired(name: str, compare: Callable[[float, float], float]) -> Interval:

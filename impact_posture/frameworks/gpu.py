@@ -53,13 +53,13 @@ class BatchMetric:
 
     The results have the package, floating-point type and device of ``q``.  If ``q`` is on the CPU, the C code
     computes the rows on all cores.  If ``q`` is on an NVIDIA GPU, the CUDA code computes the rows on this GPU.  The
-    rows of a configuration that fails are NaN.
+    results of an invalid configuration are NaN.
 
     By default, gradients are **tangent** gradients, shape (N, nv): entry i is the derivative along ``ν_i``.  For a
     floating base, the first six entries are for the linear and angular velocity in base axes.  With ``in_q``,
     gradients are derivatives with respect to the **entries of q**, shape (N, nq), and ``q`` need not be normalized.
-    The function is then ``H(u(q))``, where ``u`` divides every quaternion and every cosine-sine pair by its norm.
-    For a robot without quaternions and cosine-sine pairs, both gradients are equal.
+    In this case, the function is ``H(u(q))``, where ``u`` divides every quaternion and every cosine-sine pair by its
+    norm. For a robot without quaternions and cosine-sine pairs, both gradients are equal.
 
     Attributes:
         gradient: The functions for a single configuration.
@@ -147,7 +147,6 @@ class BatchMetric:
         return q * scales, scales
 
     def _in_coordinates(self, xp: Any, q: Any, scales: Any, tangent: Any) -> Any:
-        """Return the gradients of ``H(u(q))``, shape (N, nq), from tangent gradients and ``u(q)``."""
         grad = xp.empty_like(q)
         plain = set(range(self.gradient.nq)), set(range(self.gradient.nv))
         for names, at, speed in self._joints:

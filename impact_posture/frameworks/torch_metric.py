@@ -29,8 +29,8 @@ class TorchMetric:
     """``H`` and the objective of an export, differentiable with respect to ``q`` once.
 
     ``q`` has shape (…, nq), and results have shape (…).  The derivative is with respect to the entries of ``q``.  For
-    a floating base, it is the derivative of ``H(u(q))``, where ``u`` normalizes the quaternion.  Therefore, an
-    optimizer may change the four numbers of the quaternion freely.  The tangent gradient, shape (N, nv), is
+    a floating base, the function is ``H(u(q))``, where ``u`` normalizes the quaternion.  Therefore, an optimizer may
+    change the four numbers of the quaternion freely.  The tangent gradient, shape (N, nv), is
     ``metric.batch.value_and_gradient(q.detach(), n)``.
 
     Attributes:

@@ -70,7 +70,6 @@ def quantity_rows(impact: ResolvedImpact, initial: dict[str, Any], optimal: dict
 
 
 def _felt_rows(impact: ResolvedImpact, initial: dict[str, Any], optimal: dict[str, Any]) -> list[QuantityRow]:
-    """Return the rows of base, worst joint, normal impulse and peak force."""
     at = f"at {impact.speed:g} m/s, friction {impact.contact.friction:g}"
     rows, jumps = list[QuantityRow](), [block["jump"]["coulomb"] for block in (initial, optimal)]
     # The ``result.json`` of earlier versions has neither effects nor normal impulses.

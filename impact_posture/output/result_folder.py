@@ -99,7 +99,6 @@ def finish_result(
 
 
 def _export(folder: Path, prepared: Prepared, postures: SolvedPostures) -> Written:
-    """Write the C export, and the reason if it could not be built."""
     from impact_posture.codegen.c_names import products
     from impact_posture.codegen.export import export
     from impact_posture.impact.elasticity.contact_compression import compression

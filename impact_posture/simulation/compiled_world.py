@@ -147,7 +147,6 @@ def _source() -> str:
 
 @cache
 def _functions() -> dict[str, int]:
-    """Return struct member → address of the MuJoCo function that the member points to."""
     library = ctypes.CDLL(str(next(Path(import_mujoco().__file__).parent.glob("libmujoco.*"))))
     names = {"step1": library.mj_step1, "step2": library.mj_step2, "apply": library.mj_applyFT}
     return {name: ctypes.cast(function, ctypes.c_void_p).value or 0 for name, function in names.items()}

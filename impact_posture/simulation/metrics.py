@@ -191,5 +191,4 @@ def _change(setup: Setup, series: Series, window: Window, end: float) -> Array:
 
 
 def _largest(setup: Setup, change: Array) -> float:
-    """Return the largest norm; as in the metrics of an impact, followers do not count."""
     return float(np.linalg.norm(change[:, ~setup.robot.followers], axis=1).max(initial=0.0))

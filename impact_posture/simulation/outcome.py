@@ -97,7 +97,6 @@ def doubts(setup: Setup, runs: Iterable[Run], metrics: Iterable[Metrics], ratio:
 
 
 def _rotors_touch(setup: Setup, runs: Iterable[Run]) -> Iterator[str]:
-    """Yield a warning for each surface that the link with the rotors touched."""
     built = setup.world.built
     if not len(built.rotor_link):
         return
@@ -112,7 +111,6 @@ def _rotors_touch(setup: Setup, runs: Iterable[Run]) -> Iterator[str]:
 
 
 def _links_touch(setup: Setup, runs: Iterable[Run]) -> Iterator[str]:
-    """Yield a warning with the links of an MJCF that touched each other or a surface, and when they first touched."""
     built = setup.world.built
     if not built.link_geoms:
         return
@@ -156,7 +154,6 @@ def judge(setup: Setup, run: Run) -> tuple[Event, ...]:
 
 
 def _falls(setup: Setup, series: Series) -> list[Event]:
-    """Return violations of the bounds on tilt, clearance and sinking of a floating base."""
     if not setup.robot.floating:
         return []
     bounds, built, places = setup.scenario.bounds, setup.world.built, series.q[:, :3]
@@ -179,7 +176,6 @@ def _falls(setup: Setup, series: Series) -> list[Event]:
 
 
 def _losses(setup: Setup, run: Run) -> list[Event]:
-    """Return an event if too many ticks were relaxed, a command was repeated for too long, or the state diverged."""
     bounds, series, period = setup.scenario.bounds, run.series, setup.scenario.control.period
     events, relaxed = [], series.relaxed
     if relaxed.mean() > bounds.relaxed:
@@ -195,7 +191,6 @@ def _losses(setup: Setup, run: Run) -> list[Event]:
 
 
 def _contacts(setup: Setup, run: Run) -> list[Event]:
-    """Return missed contacts, and the first foot that left the ground for too long."""
     bounds, series, period = setup.scenario.bounds, run.series, setup.scenario.control.period
     events, impacts = [], run.of("impact")
     missed = [window for window in impacts if not window.touched]

@@ -53,7 +53,7 @@ def set_up_with(scenario: Scenario, seed: int) -> Setup:
 
 
 def _displaced(setup: Setup, generator: np.random.Generator) -> Setup:
-    """Return the scenario with a surface that is shifted and tilted from the place that the controllers expect."""
+    """Return the scenario with a surface that is shifted and tilted relative to the expected surface."""
     scenario, robot, n, spread = setup.scenario, setup.robot, setup.scenario.normal, setup.scenario.spread
     angle, heading, shift = generator.uniform(-1, 1, 3) * [np.deg2rad(spread.normal), np.pi, spread.gap]
     across = cone_axes(n)[:, 1:] @ [np.cos(heading), np.sin(heading)]
@@ -69,7 +69,6 @@ def _displaced(setup: Setup, generator: np.random.Generator) -> Setup:
 
 
 def _scaled(scenario: Scenario, speed: float, friction: float) -> Scenario:
-    """Return the scenario with its speed or force multiplied by ``speed``, and its friction by ``friction``."""
     surfaces = tuple(replace(s, friction=friction * s.friction) for s in scenario.surfaces)
     scenario, task = replace(scenario, surfaces=surfaces), scenario.task
     if isinstance(task, RepeatedContacts):

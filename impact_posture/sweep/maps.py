@@ -47,7 +47,7 @@ class Shown:
     """Summary of the maps of a sweep.
 
     Attributes:
-        points: Number of problems of the sweep.
+        points: Number of grid points of the sweep, each of which is a problem.
         counts: Number of solved points of each status.
         switches: Number of pairs of neighboring points in the maps that have different optima.
         best: Axis values and objective of the best point of each case (:class:`Case`).
@@ -174,7 +174,6 @@ def _switches(postures: Sequence[Sequence[Array | None]], problem: ConstrainedPr
 
 
 def _best(data: Any, grid: Grid, number: int, values: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return a list with the point of least objective in a case; the list is empty if no point is certified."""
     from pyarrow import compute
 
     least = (np.inf, -1)

@@ -1,4 +1,4 @@
-"""Solve one point of a sweep from warm starts, and from random starts if the warm starts lead to different optima.
+"""Solve one grid point of a sweep from warm starts, and from random starts if warm starts lead to different optima.
 
 The result has a certificate, or the reason why no posture is certified.
 """
@@ -46,9 +46,9 @@ class PointResult(NamedTuple):
     """Result of one point.
 
     Attributes:
-        row: Column name → value of the point in the table.
-        start: Posture of the point, from which other points can start; ``None`` if the point has no posture.
-        violation: Smallest known weighted sum of all constraint violations; 0 if the point is not infeasible.
+        row: Column name → value of the grid point in the table.
+        start: Posture of the grid point, from which other points can start; ``None`` without a posture.
+        violation: Smallest known weighted sum of all constraint violations; 0 if the grid point is not infeasible.
     """
 
     row: dict[str, Any]
@@ -57,7 +57,7 @@ class PointResult(NamedTuple):
 
     @property
     def q(self) -> Array | None:
-        """Posture of the point, shape (nq,); ``None`` if the point has no posture."""
+        """Posture of the grid point, shape (nq,); ``None`` without a posture."""
         return self.start and self.start.q
 
 
@@ -69,7 +69,7 @@ class Timer:
 
 
 class Walk:
-    """Problem and nonlinear program for points of a shard that differ only in the target.
+    """Problem and nonlinear program for grid points of a shard that differ only in the target.
 
     If a point needs more body pairs, problem and program are extended for this and the next points.
     """
@@ -105,7 +105,7 @@ class Walk:
 
 
 def search(walk: Walk, place: Place, guesses: Sequence[Start], beside: float = 0.0) -> PointResult:
-    """Solve one point from the optima of its neighbors and from the given posture.
+    """Solve one grid point from the optima of its neighbors and from the given posture.
 
     If these starts lead to different optima, random starts are added.  ``beside`` is the smallest violation at
     infeasible neighbors, or 0 if a neighbor has an optimum.  If ``beside`` is positive, the point is probably
@@ -126,7 +126,7 @@ def search(walk: Walk, place: Place, guesses: Sequence[Start], beside: float = 0
 
 
 def improve(walk: Walk, place: Place, known: PointResult, guess: Start) -> PointResult:
-    """Solve a point from the posture of a neighbor; return the known result if the new result is not better."""
+    """Solve a grid point from the posture of a neighbor; return the known result if the new result is not better."""
     # The base of a floating robot moves with the target, so the position of the base does not distinguish optima.
     first = 3 if walk.problem.robot.floating else 0
     if known.q is not None and np.abs(known.q - guess.q)[first:].max() < SWITCH:
@@ -143,7 +143,7 @@ def improve(walk: Walk, place: Place, known: PointResult, guess: Start) -> Point
 
 
 class _Attempt:
-    """Solver runs at one point.  If the first starts lead to different optima, ``others`` random starts are added."""
+    """Solver runs at a grid point; ``others`` random starts are added if the first starts disagree."""
 
     def __init__(self, walk: Walk, place: Place, others: int) -> None:
         self.problem, self.runs, self.fault = walk.at(walk.problem, place), 0, "no run converged"
@@ -243,7 +243,7 @@ class _Attempt:
         return PointResult(row, start)
 
     def failure(self, status: str, reason: str, violation: float = 0.0) -> PointResult:
-        """Return the result of a point without a certified posture."""
+        """Return the result of a grid point without a certified posture."""
         row = {"status": status, "reason": reason, "optima": 0, "runs": self.runs}
         return PointResult(row, violation=violation)
 
@@ -258,7 +258,6 @@ class _End(NamedTuple):
 
 
 def _optima(problem: ConstrainedProblem, ends: Sequence[_End]) -> list[_End]:
-    """Return one run for each distinct optimum, sorted from the best to the worst."""
     by_posture = {id(end.q): end for end in ends}
     return [
         by_posture[id(optimum.q)]

@@ -135,7 +135,7 @@ class _Shard:
         self._share()
 
     def predicted(self, values: Mapping[str, Any], q: Array, row: Mapping[str, Any]) -> dict[str, float | None]:
-        """Return the predicted impulse, predicted jump and attainable speed of a point."""
+        """Return the predicted impulse, predicted jump and attainable speed of a grid point."""
         choice = self._solver.normal_and_speed(values)
         impact = self._solver.template(*choice).impact
         approach = normal_jump(impact.speed, impact.restitution)
@@ -170,7 +170,7 @@ class _Shard:
         return self.results[index] is not known
 
     def _share(self) -> None:
-        """Copy the result of a point to the next points if they have the same problem."""
+        """Copy the result of a grid point to the next grid points if they have the same problem."""
         # Copy from the first point with the same problem, because this point was solved from the largest number of
         # neighbors.
         for point, is_new in self._problems():

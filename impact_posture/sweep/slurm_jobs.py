@@ -111,7 +111,6 @@ class SlurmJobs(Executor):
             _ask(_LEAVING, "scancel", *{job.job_id.partition("_")[0] for job in list(self._open.values())})
 
     def _watch(self) -> None:
-        """Pass results and errors of the jobs on until :meth:`shutdown`."""
         heard = question = time.monotonic()
         while not self._closed.wait(_RESULTS):
             now = time.monotonic()
@@ -130,7 +129,7 @@ class SlurmJobs(Executor):
     def _collect(self) -> bool:
         """Pass on the results that jobs have written; return whether there is a new result."""
         with suppress(OSError):
-            # This makes NFS read the folder again.
+            # A change of the mode makes NFS read the folder again.
             self._folder.chmod(self._folder.stat().st_mode)
         written = [item for item in list(self._open.items()) if os.path.exists(item[1].paths.result_pickle)]
         for future, job in written:
@@ -154,7 +153,6 @@ class SlurmJobs(Executor):
         return True
 
     def _end(self, future: Future[Any], result: Any) -> None:
-        """Give a future its result or its error."""
         del self._open[future]
         if isinstance(result, Exception):
             future.set_exception(result)

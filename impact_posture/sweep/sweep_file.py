@@ -33,7 +33,7 @@ _MOST = 10**15
 # Maximum number of combinations of values that need separate programs, because the settings of all combinations are
 # in memory.
 _MOST_CASES = 10**5
-# A point is warm started from at most this number of neighbors, which lie along the axes that vary fastest.
+# A grid point is warm started from at most this number of neighbors, which lie along the axes that vary fastest.
 _NEIGHBORS = 2
 
 
@@ -65,11 +65,11 @@ class Grid:
         return prod(self.shape)
 
     def place(self, point: int) -> tuple[int, ...]:
-        """Return the index of a point on each axis."""
+        """Return the index of a grid point on each axis."""
         return tuple(int(k) for k in np.unravel_index(point, self.shape))
 
     def values(self, point: int) -> dict[str, Any]:
-        """Return the value of each axis at a point."""
+        """Return the value of each axis at a grid point."""
         return {axis.name: axis.values[k] for axis, k in zip(self.axes, self.place(point), strict=True)}
 
     def neighbors(self, point: int, first: int) -> list[int]:
@@ -235,7 +235,6 @@ def _size(axis: Any, where: str) -> int:
 
 
 def _values(name: str, axis: Any) -> tuple[Any, ...]:
-    """Return the values of an axis that :func:`_size` has checked."""
     if isinstance(axis, dict):
         low, high, count = axis["from"], axis["to"], axis["count"]
         # Round, so that values such as 0.1 and 0 are exact.

@@ -24,7 +24,6 @@ _Values = tuple[Finite, ...] | tuple[tuple[Finite, ...], ...]
 
 
 def _alike(values: Any) -> bool:
-    """Return whether there are values, and all of them are numbers or vectors of the same length."""
     return len({len(value) if isinstance(value, tuple) else 0 for value in values}) == 1
 
 

@@ -112,7 +112,6 @@ def run_sweep(
 
 
 def _is_lost(error: Exception) -> bool:
-    """Return whether an error of an executor means that its workers, jobs or scheduler cannot be reached."""
     package = type(error).__module__.partition(".")[0]
     return isinstance(error, CancelledError | ConnectionError | TimeoutError) or package in _EXECUTORS
 

@@ -50,7 +50,7 @@ def nonnegative_least_squares(matrix: Array, right: Array) -> Array:
             break
         passive[slope.argmax()] = True
         while (trial := _unbounded(matrix, right, passive))[passive].min(initial=np.inf) <= 0:
-            # Move towards the trial solution until the first entry becomes zero.  This entry then stays zero.
+            # Move towards the trial solution until the first entry becomes zero, and keep this entry at zero.
             falling = passive & (trial <= 0)
             step = (x[falling] / np.maximum(x[falling] - trial[falling], np.finfo(float).tiny)).min()
             x += step * (trial - x)

@@ -243,8 +243,8 @@ def cache_folder(*parts: str) -> Path:
 def source_key(content: Iterable[str], *packages: str) -> str:
     """Return a short hash of everything that compiled code depends on.
 
-    It includes the texts in ``content`` and the source code of ``packages`` below ``impact_posture``, which generates
-    the compiled code.
+    The hash includes the texts in ``content`` and the source code of ``packages`` below ``impact_posture``, which
+    generates the compiled code.
     """
     text = "\n".join([__version__, *content, *map(_source_hash, packages)])
     return hashlib.sha256(text.encode()).hexdigest()[:32]
@@ -252,7 +252,6 @@ def source_key(content: Iterable[str], *packages: str) -> str:
 
 @cache
 def _source_hash(package: str) -> str:
-    """Return a hash of the source code of a package, read once per process."""
     digest = hashlib.sha256()
     for path in sorted((Path(__file__).parents[1] / package).glob("**/*")):
         if path.suffix in (".py", ".jinja", ".c", ".h"):

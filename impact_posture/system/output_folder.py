@@ -58,7 +58,7 @@ def check_output(out: Path, *, force: bool, kind: Kind) -> None:
             edited = f", and it holds changes of yours in {listed(changed, _SHOWN)}" if changed else ""
             raise OutputError(f"exists{edited}", where=str(out), hint=_EXISTS)
         _check_ours(out, kind)
-        # Another user can own the folder in a parent folder that everyone may write to.
+        # In a parent folder that everyone may write to, another user can own the folder.
         if not os.access(out, os.W_OK | os.X_OK):
             raise OutputError(
                 "cannot be replaced, because its files cannot be deleted", where=str(out), hint="choose another `out`"

@@ -113,7 +113,6 @@ def _start(command: list[str], folder: Path, guard: int) -> subprocess.Popen[str
 
 
 def _check(command: list[str], folder: Path, code: int, output: str) -> None:
-    """Raise an error if a command failed; ``output`` is its standard error followed by its standard output."""
     if code == 0 and (folder / command[command.index("-o") + 1]).is_file():
         return
     lines = [line for line in output.splitlines() if line.strip()]

@@ -275,7 +275,6 @@ class Controller:
         return self._command(u, self._status, assembly.acceleration(solved.z), assembly.forces(solved.z))
 
     def _far_from_unit(self, q: Array) -> bool:
-        """Return whether a quaternion or a pair (cosine, sine) in ``q`` is far from unit length."""
         return any(abs(q[part].dot(q[part]) - 1.0) > 1e-2 for part in self.state.unit_parts)
 
     def _held(self, status: Status, v: Array) -> Command:

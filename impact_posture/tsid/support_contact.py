@@ -19,7 +19,7 @@ from impact_posture.tsid.point_kinematics import Point
 from impact_posture.tsid.qp.quadratic_program import stacked_rows
 from impact_posture.tsid.state import State
 
-# Least length of the part of a heading that is orthogonal to the normal.
+# Least length of the component of ``heading`` that is orthogonal to the normal.
 ACROSS = 1e-6
 
 

@@ -101,7 +101,7 @@ def aerial_formulation(
     order: Order = "strict",
     law: LimitLaw | None = LimitLaw(),
 ) -> TaskFormulation:
-    """Return the stack of Afifi et al. 2026 for an aerial manipulator: tilt, then end effector, then posture.
+    """Return the tasks of Afifi et al. 2026 for an aerial manipulator: tilt, then end effector, then posture.
 
     Args:
         robot: The robot, whose default contact frame is the end effector.
@@ -132,7 +132,7 @@ def arm_formulation(
     order: Order = "strict",
     law: LimitLaw | None = LimitLaw(),
 ) -> TaskFormulation:
-    """Return the stack of :func:`aerial_formulation` without the tilt task, for an arm on a fixed base.
+    """Return the tasks of :func:`aerial_formulation` without the tilt task, for an arm on a fixed base.
 
     The arguments have the same meaning as in :func:`aerial_formulation`.
 
@@ -190,7 +190,7 @@ def _manipulator(
     order: Order,
     law: LimitLaw | None,
 ) -> TaskFormulation:
-    """Return the stack of the tasks in ``above``, the end effector and the posture; each strict task is one level."""
+    """Return the tasks in ``above``, the end effector and the posture; each strict task is one level."""
     frame = robot.spec.contact.frame
     if end_effector is None:
         if frame is None:

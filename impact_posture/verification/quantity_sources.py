@@ -64,7 +64,6 @@ def random_samples(robot: Robot, count: int, seed: int, normal: Array | None = N
 
 
 def _direction(generator: np.random.Generator, size: int) -> Array:
-    """Return a uniformly distributed unit vector."""
     vector = generator.normal(size=size)
     return np.asarray(vector / np.linalg.norm(vector))
 

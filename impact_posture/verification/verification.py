@@ -168,7 +168,6 @@ def verify(
 
 
 def _mujoco(objective: WorstCaseObjective) -> Source | VerificationRow:
-    """Return the source ``MuJoCo``, or a row with the reason why it is not available."""
     try:
         import_mujoco()
     except InputError as error:

@@ -11,7 +11,7 @@ static double ip_most(double a, double b)
   return a > b ? a : b;
 }
 
-/* Write the part of a heading that is orthogonal to the unit vector n, and return its length. */
+/* Write the component of the vector `heading` that is orthogonal to the unit vector n, and return its length. */
 static double ip_across(const double *n, const double *heading, double *across)
 {
   memcpy(across, heading, sizeof(double) * 3);

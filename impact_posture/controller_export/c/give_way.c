@@ -18,7 +18,7 @@ static void ip_list_gave_way(ip_context *c, const double *lower, const double *u
   }
   c->gave[0] = most > IP_OFF * size ? most : 0.0;
   for (k = 0; k < IP_LEVELS; ++k) {
-    /* Index 0 is for rows that are equations.  Index 1 is for dependent rows. */
+    /* Sums over the equations of the level (index 0) and over its dependent rows (index 1). */
     double square[2] = {0}, worst[2] = {0}, sizes[2] = {1.0, 1.0};
     for (i = r; i < r + ip_level_rows[k]; ++i) {
       const int lacks = isinf(c->low[IP_SIMPLE + i]) ? 1 : 0;

@@ -98,8 +98,8 @@ static void ip_begin_rank(ip_context *c)
 
 #if IP_LEVELS
 /* Rotate the k rows of B, of n numbers each, until they are orthogonal (Hestenes 1958): B becomes U B with an
- * orthogonal U. Then the rows of U are the left singular vectors, and the rows of B are the right singular vectors
- * times the singular values. */
+ * orthogonal U. Afterwards, the rows of U are the left singular vectors, and the rows of B are the right singular
+ * vectors times the singular values. */
 static void ip_orthogonalize(double *B, double *U, int k, int n)
 {
   int i, j, sweep, turned = 1;
@@ -168,7 +168,7 @@ static void ip_reduce(ip_context *c, double *H, double *g)
       wanted[i] = ip_dot(U + i * count, c->low + IP_SIMPLE + r, count);
       ip_combine(turned + i * N, N, U + i * count, 1, c->rows[r], N, count);
     }
-    /* Compute the mean weight of the cost over the remaining directions. */
+    /* Compute the mean weight of the cost over the directions that the earlier levels leave free. */
     for (i = 0; i < IP_NV; ++i) {
       for (j = i; j < IP_NV; ++j) {
         top += (i == j ? 1.0 : 2.0) * c->cost[i * IP_NV + j] * ip_dot(Z + i * N, Z + j * N, N);

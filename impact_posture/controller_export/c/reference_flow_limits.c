@@ -12,8 +12,8 @@ static double ip_largest(const double *x, int first)
   return most;
 }
 
-/* Return the change of a limited quantity (row r) by a displacement.  A rotation of the base across the tilt axis
- * increases the tilt to second order. */
+/* Return the change of a limited quantity (row r) that a displacement causes.  A rotation of the base across the tilt
+ * axis increases the tilt to second order. */
 static double ip_flow_ahead(const ip_flow *f, int r, const double *moved)
 {
   const double along = r < IP_JOINTS_V               ? moved[IP_BASE + r]
@@ -98,7 +98,7 @@ static void ip_flow_after(const ip_flow *f, const double *step, double time, dou
   }
 }
 
-/* Remove from a change of the flow, limit by limit, the parts that cross limits within a time. */
+/* Remove from the velocity change `step`, limit by limit, the parts that cross limits within `time` seconds. */
 static void ip_flow_along_limits(const ip_flow *f, double time, double *step)
 {
   double moved[IP_NV], across[IP_NV], over, square;

@@ -1,6 +1,6 @@
 /* Motion of the reference flow: its governor, its start, and the tasks that follow the flow. */
 
-/* Scale x down so that no absolute value of an entry exceeds a number. */
+/* Scale x down so that no absolute value of an entry exceeds `most`. */
 static void ip_shorten(double *x, double most)
 {
   const double size = ip_largest(x, 0);
@@ -31,8 +31,8 @@ static void ip_flow_moving(const ip_flow *f, const double *rate, double *back)
 #endif
 }
 
-/* Compute the velocity of the return to contacts and tasks, with limited speed and acceleration, plus the velocity of
- * moving tasks. */
+/* Compute the velocity with which q_r returns to contacts and tasks, with limited speed and acceleration, plus the
+ * velocity of moving tasks. */
 static void ip_flow_back(ip_context *c, double period, double *back)
 {
   ip_flow *f = &c->flow;

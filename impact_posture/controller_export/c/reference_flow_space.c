@@ -56,8 +56,8 @@ static void ip_flow_space(ip_flow *f)
     ip_combine(f->inverse + i * M, M, held + i, N, U, M, rank);
   }
   /* Compute reflections that map the constrained directions to the first unit vectors.  The same reflections map Z to
-   * the other unit vectors.  Their product is I - V'RV, where the rows of V are the vectors of the reflections and R
-   * is upper triangular (Golub and Van Loan, section 5.1.7).  T is R'. */
+   * the other unit vectors.  The product of the reflections is I - V'RV, where the rows of V are the vectors of the
+   * reflections and R is upper triangular (Golub and Van Loan, section 5.1.7).  T is R'. */
   for (k = 0; k < rank; ++k) {
     double *v = held + k * N, size = sqrt(ip_dot(v + k, v + k, N - k));
     v[k] += v[k] < 0.0 ? -size : size;
@@ -164,7 +164,7 @@ static double ip_flow_half(const ip_params *p, int i)
   return isfinite(half) ? half : 0.0;
 }
 
-/* Compute the controls that produce a generalized force, in units of ip_flow_half. */
+/* Compute the controls that produce a generalized force, divided by half of their permitted ranges (ip_flow_half). */
 static void ip_flow_needed(const ip_context *c, const double *force, double *shares)
 {
   double rest[IP_NV];
@@ -191,8 +191,8 @@ static void ip_flow_shares(ip_context *c, double *shares)
   }
 }
 
-/* Return the share of the acceleration `more`, 0 to 1, that the actuators permit.  Both accelerations together may
- * use the share `haste` of the range that the static controls leave. */
+/* Return the share of the acceleration `more`, 0 to 1, that the actuators permit.  `known` and `more` together may
+ * use the share `haste` of the range that the static controls do not use. */
 static double ip_flow_permitted(const ip_context *c, const double *known, const double *more, double haste)
 {
   const ip_flow *f = &c->flow;

@@ -1,7 +1,7 @@
 /* Bounds on the acceleration that keep the zero moment point of a standing robot in the polygon of its feet.  The
  * formulas are in impact_posture/tsid/flow/zero_moment_point.py. */
 
-/* Set the rows and their bounds.  The effect of the known acceleration is subtracted from the bounds. */
+/* Set the rows and their bounds; the effect of the acceleration `known` is subtracted from the bounds. */
 static void ip_flow_limit_zmp(ip_flow *f, const double *known)
 {
 #if IP_CONTACTS
@@ -29,7 +29,8 @@ static void ip_flow_limit_zmp(ip_flow *f, const double *known)
 #endif
 }
 
-/* Remove from a change of the velocity within a period the parts that move the zero moment point beyond an edge. */
+/* Remove from the velocity change `step` within `period` seconds the parts that move the zero moment point beyond an
+ * edge. */
 static void ip_flow_keep_zmp(const ip_flow *f, double period, double *step)
 {
   double across[IP_NV], over, square;

@@ -51,7 +51,7 @@ static void finish_cost(Relaxation *r) {
 }
 
 /* Minimize the cost in the remaining coordinates.  First, a program with a proximal term determines the active rows,
- * because the cost alone may be too flat.  Then the point moves to the minimum of the cost. */
+ * because the cost alone may be too flat.  Afterwards, z moves to the minimum of the cost. */
 static int solve_cost(Relaxation *r) {
     const int free = r->n - r->fixed;
     int flag = 0;

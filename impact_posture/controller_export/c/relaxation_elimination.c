@@ -58,7 +58,8 @@ static void add_exact(Relaxation *r, int entry) {
     r->rows[r->exact++] = entry;
 }
 
-/* Add an entry to the close rows, which approach their goals by least squares.  This overwrites a row of r->M. */
+/* Add an entry to the close rows, which approach their goals by least squares.  The function overwrites a row of
+ * r->M. */
 static void add_near(Relaxation *r, int entry) {
     double *b = r->M + r->near * r->n;
     memcpy(b, motion(r, entry), (size_t)(r->n - r->fixed) * sizeof *b);
@@ -111,7 +112,7 @@ static int find_step(Relaxation *r) {
         for (int i = used; i < r->near; i++) {
             double *b = C + i * n + used;
             reflect(v, *tau, b, rest - used);
-            /* If the row nearly depends on earlier rows, the difference would have few correct digits. */
+            /* If the row nearly depends on earlier rows, the difference of squares would have few correct digits. */
             if (b[0] * b[0] < (1 - 1e-6) * square[i])
                 square[i] -= b[0] * b[0];
             else

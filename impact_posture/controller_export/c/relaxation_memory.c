@@ -18,7 +18,7 @@
 #define COUNTS 1e-7
 /* Least relative decrease of a sum of squares. */
 #define PROGRESS 1e-9
-/* Largest violation of level 0 by the result. */
+/* Largest violation of level 0 that a result may have. */
 #define WRONG 1e-7
 /* Largest violation of a bound in the program of the cost, relative to its unit. */
 #define ROUNDING 1e-10

@@ -1,4 +1,4 @@
-/* Rows of the program, and the coordinates in which the point may still move. */
+/* Rows of the program, and the coordinates in which z may still move. */
 
 static double norm(const double *a, int n) { return sqrt(ip_dot(a, a, n)); }
 

@@ -131,7 +131,6 @@ def _panel(axes: Any, plane: Plane, states: list[_State], limit: float, unit: st
 
 
 def _tangents(axes: Any, plane: Plane, state: _State, limit: float) -> None:
-    """Draw the two tangent lines of the projection that are perpendicular to n."""
     flat = plane.axes @ state.at.normal
     flat = flat / np.linalg.norm(flat)
     along = np.array([-flat[1], flat[0]]) * 3 * limit
@@ -189,7 +188,7 @@ def _legend(axes: Any, states: list[_State], unit: str, view: ResultView) -> Non
         radii = np.sqrt(np.maximum(np.linalg.eigvalsh(state.at.ellipsoid)[::-1], 0.0))
         largest = max(float(radii[0]), 1e-300)
         rows.append(f"{state.word}  " + "  ".join(number(r if r > 1e-7 * largest else 0.0) for r in radii))
-    # The annotation is relative to the legend, so the semi-axes are always below it.
+    # The semi-axes are written relative to the legend, so they are always below the legend.
     look = {"xycoords": legend, "textcoords": "offset points", "va": "top", "fontsize": SMALL, "linespacing": 1.4}
     axes.annotate("\n".join(rows), (0, 0), (0, -8), **look)
 
@@ -234,7 +233,7 @@ def uncertainty_handles(view: ResultView) -> list[Any]:
 
 
 def _cones(view: ResultView) -> list[Array]:
-    """Return the world axes of the cones of normals: the result of :func:`normals`, or nothing without a cone."""
+    """Return the axes of the cones of normals, world, as :func:`normals` does; empty without a cone."""
     return [n for _, n in normals(view.before, view.after)] if view.objective.normal_cone_deg > 0 else []
 
 

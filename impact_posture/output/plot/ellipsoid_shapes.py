@@ -104,7 +104,6 @@ def principal_sections(matrix: Array) -> list[Array]:
 
 
 def _semi_axes(matrix: Array) -> Array:
-    """Return the semi-axes as columns, the longest last."""
     values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
@@ -123,7 +122,7 @@ def polar(matrix: Array, infinite: float) -> tuple[Array, Array]:
     """Return the matrix ``A⁻¹`` of the ellipsoid ``{f: fᵀAf ≤ 1}``, and its unbounded directions.
 
     ``A`` is ``matrix``, positive semidefinite, shape (3, 3).  The ellipsoid is unbounded in the null space of ``A``.
-    ``A⁻¹`` gives it the half-length ``infinite`` there.  The unbounded directions are columns, shape (3, k).
+    In ``A⁻¹``, these unbounded directions, columns of shape (3, k), have the half-length ``infinite``.
     """
     values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
     bounded = values > 1e-10 * max(float(values[-1]), 1e-300)

@@ -247,7 +247,6 @@ def draw_sticks(axes: Any, state: Skeleton, line: dict[str, Any], plane: Plane |
 
 
 def _body(axes: Any, corners: Array, line: dict[str, Any], plane: Plane | None) -> None:
-    """Draw a box with these corners, shape (8, 3), in 3-D, or its outline on ``plane``."""
     if plane is not None:
         around = outline(plane.axes @ corners.T)
         axes.fill(*around, facecolor=line["color"], alpha=0.12, linewidth=0, zorder=1.5)

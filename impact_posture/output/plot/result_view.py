@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 _Data = TypeVar("_Data")
 
 ALONE = "numbers and ellipsoids"
-"""First words of the header text that names the contact in the figures, if there are several contacts."""
+"""Start of the line in the header that names the shown contact, if there are several contacts."""
 
 SEPARATOR = "  ·  "
 """Separator of the facts in a header line."""

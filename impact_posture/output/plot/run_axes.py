@@ -25,7 +25,7 @@ AT_LIMIT: dict[str, Any] = {
     "linestyle": "", "marker": "D", "markersize": 3.2, "color": INK, "markeredgecolor": "white",
     "markeredgewidth": 0.4, "zorder": 5,
 }  # fmt: skip
-# Number of bins across a panel.
+# Number of bins of ticks across the width of a panel.
 _BINS = 1000
 
 
@@ -163,7 +163,6 @@ def _scale_metric(axes: Any, values: Sequence[Array]) -> None:
 
 
 def _common_handles(views: Sequence[RunView], panels: Sequence[Panel]) -> list[Any]:
-    """Return the legend entries that all panels share: shades, limits and stops."""
     words = {"impact": "impact window" if not views[0].pushed else "push", "dwell": "dwell"}
     kinds = {span.kind for view in views for span in view.windows}
     handles: list[Any] = [Patch(label=words[kind], **SHADES[kind]) for kind in words if kind in kinds]
@@ -182,8 +181,8 @@ def _common_handles(views: Sequence[RunView], panels: Sequence[Panel]) -> list[A
 def _legend(body: Any, shared: Sequence[Any], named: Sequence[tuple[str, Any]]) -> None:
     """Put the legend to the right of the panels, or below them if no curve has a name.
 
-    ``shared`` are entries for all panels.  ``named`` are pairs of a heading and the axes with the curves below this
-    heading.  The heading is omitted if only one of the axes has named curves.
+    ``shared`` are legend entries for all panels.  ``named`` are pairs of a heading and the axes with the curves below
+    this heading.  The heading is omitted if only one of the axes has named curves.
     """
     groups = [(what, handles) for what, axes in named if (handles := axes.get_legend_handles_labels()[0])]
     if not groups:

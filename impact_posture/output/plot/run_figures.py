@@ -126,12 +126,10 @@ def controls_comparison_figure(views: Sequence[RunView]) -> Figure:
 
 
 def _run_and_impact(panel: Panel, which: int, view: RunView) -> list[Cell]:
-    """Return a cell for the whole run and, if there is an impact, a cell for the first impact."""
     return [Cell.of(panel, which, clip) for clip in (whole(view), first_impact(view)) if clip is not None]
 
 
 def _notes(panels: Sequence[Panel], cells: Sequence[Sequence[Cell | None]]) -> list[str]:
-    """Return the notes of the panels and, if there are two columns, a note on the columns."""
     left = any(cell is not None and cell.frame[1].scale != 1.0 for cell in cells[0])
     return [*dict.fromkeys(panel.note for panel in panels if panel.note), *[LEFT] * left]
 

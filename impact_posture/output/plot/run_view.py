@@ -27,7 +27,7 @@ Flags = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class RunView:
-    """Run of a controller in a scenario, with n ticks.  The states in a row belong to the end of the tick.
+    """Run of a controller in a scenario, with n ticks.  Each row contains the state at the end of a tick.
 
     Attributes:
         contact: Impact contact with its frame, its offset, and the world normal out of the surface (or along a push).

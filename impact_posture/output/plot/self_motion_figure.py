@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from impact_posture.posture.search.global_search import SelfMotionMap
 
 _CURVES = "Each curve is one component: it is closed, or runs from one limit to another."
-_SURFACES = "Each panel is one component, over the two joints that move most on it. Its parts may cover each other."
+_SURFACES = "Each panel is one component, over the two joints that move most on it; folds may cover each other."
 _GRAY = "Gray: limits or inequalities are violated. Postures that differ by full turns count as one."
 # Maximum number of surfaces in the figure.
 _PANELS = 4

@@ -165,7 +165,6 @@ def link_tip(model: pin.Model, joint: int) -> Array:
 
 
 def _rotors(robot: Robot, places: list[pin.SE3]) -> Array:
-    """Return circles perpendicular to the thrust directions, with a radius that follows from the rotor distances."""
     propulsion = robot.spec.propulsion
     if propulsion is None:
         return np.zeros((0, 3, 24))

@@ -111,7 +111,6 @@ def _window(low: Array, high: Array, view: RunView, plane: Plane) -> tuple[Array
 
 
 def _surface(axes: Any, view: RunView, plane: Plane, low: Array, high: Array) -> None:
-    """Draw the surface as a line with a hatched strip behind it, unless the surface faces the reader."""
     n = plane.axes @ np.array(view.contact.normal)
     if view.surface is None or np.linalg.norm(n) < 1e-6:
         return

@@ -33,8 +33,8 @@ def frame_space(axes: Any, low: Array, high: Array, unit: str, bins: int, *, azi
         axis = getattr(axes, f"{name}axis")
         share = float(size[k] / size.max())
         longest = _set_ticks(axis, low[k], high[k], round(bins * share), room=np.inf if name == "z" else 95 * share)
-        # In a cube, matplotlib centers numbers 8 points and names 21 points from their axis.  In a flat box, both are
-        # nearer.
+        # In a cube, matplotlib centers numbers 8 points and names 21 points from their axis.  In a flat box, numbers
+        # and names are nearer.
         scale = max(float(np.delete(size, k).mean() / size.max()), 0.25)
         axes.tick_params(axis=name, pad=(8 if name == "z" else 6) / scale - 8, labelsize=TINY)
         getattr(axes, f"set_{name}label")(f"{name}  [{unit}]", labelpad=(longest / 2 + 4) / scale - 13, size=SMALL)

@@ -144,12 +144,12 @@ def shared_legend(body: Any, handles: Sequence[Any], place: str) -> None:
     widths = [text_width(str(h.get_label()).replace("$", ""), size) + size * (handle + 0.8 + gap) for h in handles]
 
     def width(columns: int) -> float:
-        # Entries fill column by column.
+        # Matplotlib fills a legend column by column.
         rows = -(-len(widths) // columns)
         return sum(max(widths[k : k + rows]) for k in range(0, len(widths), rows))
 
     columns = next((n for n in range(len(handles), 1, -1) if width(n) <= room), 1)
-    # Keep the number of rows, but distribute the entries evenly over the rows.
+    # Use as few columns as this number of rows permits.
     columns = -(-len(handles) // -(-len(handles) // columns))
     look = {"ncols": columns, "handlelength": handle, "columnspacing": gap}
     body.legend(handles=list(handles), loc=f"outside {place} center", **look)

@@ -149,7 +149,6 @@ def draw_robot(robot: Robot, meshes: bool = False) -> DrawnRobot:
 
 
 def _placed_solids(robot: Robot, described: list[LinkShape], hulls: set[str]) -> PlacedSolids:
-    """Return the meshes of the shapes; for names in ``hulls``, the convex hulls of the meshes."""
     loaded = load_geometry(robot, described)
     by_name = {shape.name: shape for shape in described}
     solids: dict[tuple[object, ...], Solid] = {}
@@ -181,7 +180,7 @@ def _welded(solid: Solid, bits: int) -> Solid:
     _, first, merged = np.unique(keys, return_index=True, return_inverse=True)
     faces = merged[solid.faces]
     faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
-    # Sort corners by their first use.  Then successive corners are close to each other and compress well.
+    # Sort corners by their first use, so that successive corners are close to each other and compress well.
     used, at = np.unique(faces, return_index=True)
     order = used[np.argsort(at)]
     renamed = np.empty(len(first), dtype=np.uint32)
@@ -246,7 +245,6 @@ def license_of(mesh: Path | None) -> MeshLicense | None:
 
 @cache
 def _read_license(folder: Path) -> MeshLicense:
-    """Read README.md (lines ``license:`` and ``upstream:``) and LICENSE of a package."""
     readme, text = (
         read_bytes(path).decode(errors="replace") if path.is_file() else ""
         for path in (folder / "README.md", folder / "LICENSE")

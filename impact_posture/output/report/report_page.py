@@ -132,7 +132,6 @@ def _template(name: str) -> Any:
 
 
 def _charts(track: Track) -> list[dict[str, Any]]:
-    """Return the polylines, axis numbers and texts of the chart of each curve."""
     charts = []
     x = _LEFT + (_RIGHT - _LEFT) * (track.times - track.times[0]) / ((track.times[-1] - track.times[0]) or 1.0)
     for name, unit, values in track.curves:

@@ -37,7 +37,7 @@ Curve = tuple[str, str, Array]
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """Motion of the robot, given at frames.
+    """Motion of the robot as a sequence of animation frames.
 
     Attributes:
         name: Name of the motion in a report with several motions.
@@ -137,7 +137,8 @@ class ReportScene:
                 twist, lever = data.v[j], robot.model.inertias[j].lever
                 arrows[k, j] = data.oMi[j].rotation @ (twist.linear + np.cross(twist.angular, lever))
                 centers[k, j] = data.oMi[j].act(lever)
-        # The viewer interpolates linearly.  So choose the sign of each quaternion that is closer to its predecessor.
+        # The viewer interpolates linearly.  For each quaternion, choose the sign that is closer to the previous
+        # quaternion.
         for before, now in pairwise(poses[:, :, 3:]):
             now[(before * now).sum(axis=-1) < 0] *= -1
         frame_impacts, upper = list(zip(*track.impacts, strict=True)), np.triu_indices(3)
@@ -178,7 +179,6 @@ def impact_curves(impacts: Sequence[ImpactQuantities], metric: Metric, where: st
 
 
 def _norm(vectors: Array) -> float:
-    """Return the largest norm of the vectors along the last axis of an array."""
     return float(np.linalg.norm(vectors, axis=-1).max())
 
 
@@ -194,7 +194,6 @@ def _solid(solid: Solid) -> dict[str, Any]:
 
 
 def _rows(frames: Iterable[list[Array]]) -> dict[str, Any]:
-    """Encode the arrays of all contacts with :func:`_levels`, one row for each frame."""
     return _levels(np.array([np.concatenate(each) for each in frames]))
 
 

@@ -119,7 +119,6 @@ def _jumps(view: ResultView, postures: Array) -> tuple[Array, Array]:
 
 
 def _together(view: ResultView) -> bool:
-    """Return whether the common jump of several contacts is defined at the initial and the optimal posture."""
     ends = (view.q_initial, view.q_optimal)
     return bool(view.objective.others) and all(coulomb_jumps(view.objective, q, view.speed) for q in ends)
 
@@ -127,7 +126,7 @@ def _together(view: ResultView) -> bool:
 def _frames(view: ResultView) -> tuple[Array, str, Array, Array | None]:
     """Return the times (or path lengths) of all frames, their unit, and the postures at the frames.
 
-    The fourth value contains the generalized velocities at the frames of a strike, which include the contact.
+    For a strike, the frames include the contact, and the generalized velocities at the frames are also returned.
     """
     if view.motion is not None and len(view.motion.t) > 1:
         played, strike = view.motion.played, view.motion.strike

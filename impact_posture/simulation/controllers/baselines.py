@@ -41,7 +41,8 @@ def resting_posture(driver: Driver, seconds: float, *, ahead: float = 0.0) -> Ar
 
     The robot executes the commanded acceleration exactly, without physics engine, sensors and motors.  The motion
     ends when :attr:`Driver.level` is 1 and ``‖ν‖`` has been below 1e-3 for 0.2 s, or after ``seconds``.  If ``ahead``
-    is not zero, the end effector then moves ``ahead`` (m) towards the surface, and the robot comes to rest again.
+    is not zero, the end effector moves ``ahead`` (m) towards the surface afterwards, and the robot comes to rest
+    again.
     """
     setup, period = driver.setup, driver.controller.period
     q, v, t = setup.q.copy(), np.zeros(setup.robot.nv), 0.0
@@ -126,9 +127,9 @@ class ReleaseDriver(RobustDriver):
 
     Without ``K_p``, the robot reaches the optimum; with ``K_p``, it would come to rest before the optimum.  The scale
     ``λ`` of the term is the larger of the curvatures at the start and at the offline optimum.  Therefore, the
-    stiffness of the term hardly exceeds ``K`` between these postures.  If ``H`` decreases by less than the share
+    stiffness of the term hardly exceeds ``K`` between start and optimum.  If ``H`` decreases by less than the share
     :attr:`LEAST` within :attr:`PATIENCE` (s), the controller holds the reached posture.  The term must have
-    ``spring="release"`` and an activation that is not live.
+    ``spring="release"`` and ``activation.live = False``.
     """
 
     PATIENCE, LEAST = 0.5, 0.01

@@ -114,7 +114,7 @@ def compiled_tick(controller: Controller, structure: Structure, objective: Worst
                 raise CompilerError(
                     "the compiler wrote no library", where=str(folder), hint="set CC to another compiler"
                 )
-    # Do not use names of the manifest, because another robot with the same code may have written the manifest.
+    # Do not use names of the manifest, because it may come from another robot with the same code.
     return CompiledTick(controller, structure, CompiledController.load(folder))
 
 

@@ -67,12 +67,12 @@ MEANING: dict[str, str] = {
     "stiff": "holds the start posture, as stiff as the impact-robust term is where robust comes to rest",
     "posture-stiff": "like posture, with the stiffness of the impact-robust term at the optimum",
     "invariant": "nominal, but impulses do not affect the velocity feedback around the impact",
-    "reference-spreading": "nominal, with references before and after the impact, without velocity feedback between",
+    "reference-spreading": "nominal, with references before and after the impact, no velocity feedback in between",
     "impact-aware": "nominal, with an approach so slow that an impact keeps joint rates and torques within limits",
     "walker": "the posture target follows the negative gradient of H",
 }
 CONTROLLERS = tuple(MEANING)
-# This suffix adds the stiffness that the impact-robust term has at the posture in which the controller rests.
+# Suffix of a name that adds the stiffness of the impact-robust term at the posture where the controller rests.
 _STIFF = "-stiff"
 _PLAIN = {
     "nominal": Driver,
@@ -357,7 +357,6 @@ class ControllerFactory:
 
 
 def _without_stop(path: PosturePath) -> PosturePath:
-    """Return a path with a strike without its follow-through."""
     return replace(path, strike=path.strike and replace(path.strike, follow_through=None))
 
 

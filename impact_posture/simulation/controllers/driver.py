@@ -194,7 +194,7 @@ class PostureDriver(Driver):
 class PathDriver(Driver):
     """Nominal controller whose posture follows a timed path after :meth:`brace`.
 
-    Between two rows of the path, the motion is the quintic polynomial that its files name.  The targets of
+    Between two rows of the path, the motion is the quintic polynomial that the path files describe.  The targets of
     center of mass and base orientation follow from the posture.
 
     Attributes:

@@ -99,7 +99,6 @@ class InvariantDriver(ImpactFeedbackDriver):
         return float(-np.expm1(-left / self.FADE)) if left > 0 else 0.0
 
     def _correction(self, reading: Reading) -> Array:
-        """Return the velocity correction ``M⁻¹Jᵀ λ*``, shape (nv,)."""
         state, formulation = self._state.update(reading.q, reading.v), self.controller.formulation
         change = supported_inverse(state, formulation.contacts) @ state.at(self._point).jacobian[:3].T
         leading = [task for task in formulation.tasks if task is not self.posture] or [self.posture]

@@ -177,7 +177,7 @@ class ContactLog:
         return forces, normals
 
     def _slips(self) -> Array:
-        """Return the largest tangential speed of the contact points of each shape at each mark, shape (n, shapes)."""
+        """Return the largest tangential speed of the contact points of each shape, for each call of :meth:`mark`."""
         slips = np.zeros((len(self._marks), self._count))
         touching = [k for k, (_, mark) in enumerate(self._marks) if mark]
         if not touching:

@@ -112,7 +112,6 @@ def _is_distance_field(model: Any, g: int) -> bool:
 
 
 def _hull(model: Any, mesh: int) -> Array:
-    """Return the corners of the convex hull with which a mesh collides, m, shape (k, 3)."""
     corners, _ = mesh_surface(model, mesh)
     if model.mesh_graphadr[mesh] < 0:
         return corners

@@ -76,7 +76,7 @@ class Throw(ContactLaw, Settling):
 
 
 def thrown_impulses(oracle: ImpactOracle, q: Array, throw: Throw, speed: float) -> tuple[Array, Array, Array]:
-    """Return three impulses of the ball, shape (3,) each: without friction, if the ball sticks, with its friction.
+    """Return three impulses of the ball, shape (3,) each: for no friction, for sticking, and for its friction.
 
     The mobility at the contact is ``B + D``.  ``B = J M⁻¹Jᵀ`` is the mobility of the robot.  The mobility ``D`` of
     the ball is ``1/m`` along the normal and ``3.5/m`` in the tangent plane.  Without rebound, the impulse is

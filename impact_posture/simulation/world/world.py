@@ -234,7 +234,7 @@ class World:
         return Trace._make([*parts, stopped, *self._log.look()])
 
     def truth(self) -> Truth:
-        """Return the true state, and clear all marks, peak forces and times of first touches."""
+        """Return the true state, and clear recorded states, peak forces and times of first touches."""
         self.mark()
         t, q, v, speeds, torques, stopped, *contacts = (column[-1] for column in self.trace())
         shapes = tuple(

@@ -44,7 +44,7 @@ class BuiltScene:
     """Model of a scene before MuJoCo compiles it.
 
     Attributes:
-        mjcf: The MuJoCo model.  Its actuators have the order of ``u``: first the rotors (thrust, N), then the joints
+        mjcf: The MuJoCo model.  The actuators have the order of ``u``: first the rotors (thrust, N), then the joints
             (N·m or N).
         normals: Unit normal of each surface, by name.
         points: Point on each surface, world, m, by name.
@@ -168,7 +168,6 @@ def _add_pair(mjcf: Mjcf, first: str, second: str, law: ContactLaw) -> None:
 
 
 def _set_physics(spec: Any, physics: Physics) -> None:
-    """Set the time step, the solver, gravity, and the contact law of the joint stops."""
     mujoco = import_mujoco()
     spec.option.timestep = physics.timestep
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -197,7 +196,6 @@ def _set_passive(mjcf: Mjcf, robot: Robot) -> None:
 
 
 def _placement(robot: Robot, numeric: Numeric, shape: Shape, normal: Array | None) -> pin.SE3:
-    """Return the pose of a shape in the frame of its joint."""
     point = point_on(robot, shape.frame)
     frame = pin.SE3(point.rotation, point.position)
     if shape.center is not None:
@@ -258,7 +256,6 @@ def _add_rotors(mjcf: Mjcf, robot: Robot) -> None:
 
 
 def _add_motors(mjcf: Mjcf, robot: Robot) -> None:
-    """Add a MuJoCo motor for each entry of ν after the entries of the floating base."""
     transmission = import_mujoco().mjtTrn.mjTRN_JOINT
     for slot in Chart(robot.model).slots[1 if robot.floating else 0 :]:
         if slot.kind.family not in _DRIVEN:

@@ -17,11 +17,11 @@ NEW = 0.1
 
 
 class ProbeDirections:
-    """Unit vectors along the r free directions of the constraints.  Each round of r vectors is orthogonal.
+    """Unit vectors in the r-dimensional null space of the constraints.  Each round of r vectors is orthogonal.
 
     The vectors are projections of fixed directions, because the columns of the basis ``Z`` are not unique.  The
     entries of the fixed directions are the fractional parts of ``k² φ`` minus 1/2, where φ is the golden ratio in 32
-    bits.  These entries are spread like random numbers and are equal, bit for bit, on every machine.
+    bits.  Such entries are spread like random numbers and are equal, bit for bit, on every machine.
 
     Attributes:
         count: Number of directions in which the flow has measured.

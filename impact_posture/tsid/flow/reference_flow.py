@@ -306,7 +306,6 @@ class ReferenceFlow:
         self._tick, self._elapsed, self.resting = 0, 0.0, False
 
     def _place(self, q: Array) -> None:
-        """Evaluate the state and the Jacobian of the constraints at a posture."""
         state = self._state.update(q, None)
         for task, J in self._turning:
             J[:] = task.jacobian(state)

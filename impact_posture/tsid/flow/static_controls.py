@@ -82,9 +82,9 @@ class StaticControls:
     def permitted(self, M: Array, known: Array, more: Array, shares: Array, most: float) -> float:
         """Return the fraction of the acceleration ``more``, 0 to 1, that the actuators permit.
 
-        The acceleration ``known``, shape (nv,), is used in any case.  ``known`` and the permitted part of ``more``
-        may together use the fraction ``most`` of the control ranges that the static controls ``shares``, shape (m,),
-        do not use.  The contact forces follow from the last call of :meth:`shares`.
+        The acceleration ``known``, shape (nv,), is executed in any case.  The static controls ``shares``, shape (m,),
+        do not use the whole control ranges.  ``known`` and the permitted part of ``more`` together may use the
+        fraction ``most`` of the rest.  The contact forces follow from the last call of :meth:`shares`.
         """
         self._pair[:, 0], self._pair[:, 1] = known, more
         taken, added = self._needed(M @ self._pair).T
@@ -105,8 +105,8 @@ def support_edges(state: State, contacts: Sequence[SupportContact]) -> tuple[Arr
     If the center of mass ``c`` is in the polygon, each of n soles carries at least 60 %/n of the weight.  A sole
     without load would leave the ground at the smallest push.  Therefore, each corner of a sole is moved towards the
     mean of the same corners of all soles.  Point feet are not moved, because three of four feet can carry a robot.
-    If the feet do not span an area, the result has four edges with infinite ``b``.  These edges prevent any motion of
-    the center of mass.
+    If the feet do not span an area, the result has four edges with infinite ``b``.  Four such edges prevent any
+    motion of the center of mass.
 
     Raises:
         InputError: The robot has contacts, but its base is fixed.

@@ -110,7 +110,6 @@ def _refined(levels: Sequence[Level], y: Array, near: float) -> Array:
 
 
 def _no_worse(levels: Sequence[Level], new: Array, old: Array) -> bool:
-    """Return whether ``new`` is lexicographically not worse than ``old``."""
     for level in levels:
         now, before = (float(np.linalg.norm(_violation(level, y))) for y in (new, old))
         if abs(now - before) > 1e-6 * before + 1e-10 * _size(old) * float(_lengths(level).max()):

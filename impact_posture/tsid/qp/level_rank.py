@@ -36,8 +36,8 @@ class LevelRank:
       ``α = x²(3 − 2x)``.  ``q = Zv`` is the row's direction of motion (not the configuration), where ``v`` is
       the column of ``V`` that belongs to ``s``.  ``c`` is the row's right-hand side.  The term is multiplied by the
       mean weight of the accelerations in the cost.  With decreasing ``x``, the influence of the row decreases
-      smoothly to zero, so accelerations are continuous through a singular posture.  The accelerations are at most
-      ``3/s₀`` times ``c``.  In the less important levels, the direction has the factor ``√(1 − α)``.
+      smoothly to zero, so accelerations are continuous through a singular posture.  The row causes accelerations of
+      at most ``3c/s₀``.  The less important levels act along this direction with the factor ``√(1 − α)``.
 
     The result depends only on the present rows and on their lengths at reset.  While all rows are independent, all of
     them remain equations.  A singular value changes at most by the norm of the change of the matrix (Weyl 1912), so

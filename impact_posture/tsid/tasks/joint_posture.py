@@ -20,7 +20,7 @@ class JointPosture(Task):
     """Regulate the posture by ``ν̇* = K_p (q_des ⊖ q) − K_d ν`` (Afifi et al. 2026, nominal posture).
 
     ``⊖`` is the difference on the configuration manifold, in the tangent space at ``q``, and includes the base.  If
-    other tasks control the base, set the weight of its six entries to zero (``base_weight = 0``).
+    other tasks control the base, set the weight of the six base entries to zero (``base_weight = 0``).
 
     :meth:`move_to` fades in a new ``q_des``, so that ``ν̇*`` does not jump.
 

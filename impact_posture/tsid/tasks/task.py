@@ -43,7 +43,7 @@ class Task(ABC):
 
     points: Sequence[Point] = ()
     constant = False
-    """Whether ``J`` is constant and ``J̇ν`` is zero.  If true, a stack evaluates ``J`` only at ``reset``."""
+    """Whether ``J`` is constant and ``J̇ν`` is zero, so that :class:`TaskStack` evaluates ``J`` only at ``reset``."""
 
     def __init__(
         self, name: str, size: int, *, kp: ArrayLike = 0.0, kd: ArrayLike | None = None, weight: ArrayLike = 1.0
@@ -113,7 +113,7 @@ class Task(ABC):
         """Advance the internal memory, such as ramps, by ``dt`` seconds.  By default, this method does nothing."""
 
     def bind(self, velocity: Array, acceleration: Array) -> None:
-        """Store the desired velocity and acceleration in the buffers of a stack, so that no tick must copy them."""
+        """Keep desired velocity and acceleration in buffers of a :class:`TaskStack`, so that no tick copies them."""
         velocity[:], acceleration[:] = self._velocity, self._acceleration
         self._velocity, self._acceleration = velocity, acceleration
 
