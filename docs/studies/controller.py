@@ -130,7 +130,7 @@ def growth(_: int) -> Iterator[str]:
 def times_of_ticks(_: int) -> Iterator[str]:
     """Yield times of a tick in Python, in C, and in handwritten C++. Each row appears as soon as it is measured."""
     ratios = list[list[str]]()
-    yield f"Median / p99 of {TIMED} quiet states, µs; each tick of C and C++ is the least of {REPETITIONS}."
+    yield f"Median / p99 of {TIMED} quiet states, µs; a tick in C and C++ is the shortest of {REPETITIONS}."
     yield ""
     with ExitStack() as stack:
         try:

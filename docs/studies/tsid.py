@@ -119,7 +119,7 @@ def lines(request: Request) -> Iterator[str]:
         "µs. Wall time\n"
         "includes other programs on the machine. Robust / nominal: ratio of medians, and of means of the shortest\n"
         "99 %, with the gradient every fifth tick (in brackets: every tick). Flow: controller with a moving\n"
-        "reference flow; ratio of means of the shortest 99 %, and the 99th percentile."
+        "reference flow, with the ratio of means of the shortest 99 % and the 99th percentile."
     )
     yield ""
     solvers = []

@@ -200,7 +200,7 @@ def test_the_page_in_short(
     monkeypatch.setattr("sys.argv", ["studies", "hits", "--data", str(windows), "--count", "1"])
     assert main() == 0
     text = capsys.readouterr().out
-    assert "3 of posture 1, heavy box" in text
+    assert "3 (posture 1, heavy box)" in text
     heads = ("Fitted", "Loss of tip speed", "Joint jumps", "Order", "Which inertia", "Impulse", "Jump of each joint")
     assert all(f"### {head}" in text for head in heads)
     assert "nan" not in text

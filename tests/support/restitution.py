@@ -44,8 +44,7 @@ def ideal_restitution(damping: float) -> float:
     """Return the restitution of ``r'' = −2ζω r' − ω² r`` for any ω; the contact ends when its force vanishes.
 
     The value is ``exp(−2ζ arccos ζ/√(1 − ζ²))`` for ζ < 1, ``e⁻²`` for ζ = 1, ``exp(−2ζ arcosh ζ/√(ζ² − 1))`` for ζ >
-    1.  If the share d of a :class:`ContactLaw` is near 1 and its time constant is many time steps, the law
-        approaches this value.
+    1.  A :class:`ContactLaw` approaches this value if d is near 1 and T is many time steps.
 
     Args:
         damping: Damping ratio ζ, at least zero.

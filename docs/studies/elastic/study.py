@@ -152,7 +152,7 @@ def lines(request: Request) -> Iterator[str]:
     yield f"{request.count} random postures and normals (seed {request.seed}) of each robot, {len(rows)} impacts:"
     yield ""
     yield from (f"- `{name}`: {arm.words}; `{arm.frame}`" for name, arm in STUDIED.items() if request.only in name)
-    yield from ("", f"Approach speed {SPEED:g} m/s, plastic, no damping. Errors are errors of the norm.", "")
+    yield from ("", f"Approach speed {SPEED:g} m/s, plastic, no damping. Errors are relative errors of norms.", "")
     yield from ("### Results", "", *_verdicts(rows, request), "")
     yield from ("### Error of the peak link velocity: median (largest), %", "")
     yield from (*_errors(rows, "error"), "", "### Error of the peak force: median (largest), %", "")

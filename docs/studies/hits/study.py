@@ -162,8 +162,7 @@ def lines(request: Request) -> Iterator[str]:
     yield from ("### Loss of tip speed", "", *_losses(evaluations), "")
     yield from ("### Joint jumps", "", *_jumps(evaluations), "")
     yield from ("### Order of the models", "", *_order(evaluations), "")
-    yield "Errors with the jumps as recorded, which contain the effects of trend and controller, and with the contact"
-    yield "one row later:"
+    yield "Errors with the recorded jumps, which include trend and controller, and with the contact one row later:"
     later = dict(by_group(moved for hit in hits if (moved := hit.later()) is not None))
     others = {"as recorded": Evaluation(groups, recorded=True)}
     if FITTED in later:
@@ -177,7 +176,7 @@ def lines(request: Request) -> Iterator[str]:
 
 
 def _recordings(groups: Groups, left_out: Sequence[str], request: Request) -> Iterator[str]:
-    used = ", ".join(f"{len(hits)} of {group}" for group, hits in groups.items())
+    used = ", ".join(f"{len(hits)} ({group})" for group, hits in groups.items())
     yield f"Hits: {used}. Intervals contain 95 % of {request.count} bootstrap resamples (seed {request.seed}) of the"
     yield "hits, with a new fit for each resample."
     if left_out:

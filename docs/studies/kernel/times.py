@@ -99,7 +99,7 @@ def lines(request: Request) -> Iterator[str]:
     names = [f"{r.samples.robot.name} (nv {r.samples.robot.nv})" for r in reports]
     body = [[words, *[r.compared(*which) for r in reports]] for words, which in _AGAINST.items()]
     yield from table(["how many times faster H with ∇H is than", *names], body)
-    yield from ("", "In brackets: a configuration of a batch, on the same core.", "")
+    yield from ("", "In brackets: time of a configuration in a batch, on the same core.", "")
     for report in reports:
         yield from _robot(report)
     commands: dict[str, list[str]] = {}

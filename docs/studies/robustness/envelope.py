@@ -32,7 +32,7 @@ _DEVIATIONS = {
     },
     "aerial-lateral": {
         "the arm is mounted below the base's center, 8 cm behind its place in the URDF": "mounted as in the URDF",
-        "it approaches at 0.3 m/s, because the rotors hardly push sideways": "speed × 1.67 (as vertical)",
+        "the robot approaches at 0.3 m/s, because the rotors hardly push sideways": "speed × 1.67 (as vertical)",
     },
 }
 _HEAD = (
@@ -104,19 +104,19 @@ def _counts(records: Records) -> Iterator[str]:
     counts = []
     for name, own in records.items():
         draws, lacking = sum(not r.draw.name for r in own), [r for r in own if not r.documents]
-        words = f"of `{name}` {len(own) - draws} variations one at a time and {draws} random draws"
+        words = f"in `{name}`, {len(own) - draws} variations one at a time and {draws} random draws"
         if lacking:
             reasons = ", ".join(f"{r.draw.name} ({r.rejected[-1]})" for r in lacking)
             words += f", without the points at which nominal itself fails: {reasons}"
         counts.append(words)
     planned = sum(len(VARIATIONS[name]) for name in records)
-    yield f"The points are {'; '.join(counts)}."
+    yield f"Points: {'; '.join(counts)}."
     yield f"The plan has {planned} variations in all, and 40 random draws of each scenario."
     yield (
         f"The runs are shorter than the shipped scenarios: one seed of noise, {COUNT} contacts instead "
         f"of 5, {DWELL:g} s "
-        f"behind the surface and {PAUSE:g} s between contacts; the pushes have both signs. So the motion back "
-        "from the surface is part of the second after an impact, for all controllers."
+        f"behind the surface and {PAUSE:g} s between contacts; the pushes have both signs. So the second after "
+        "an impact includes the motion back from the surface, for all controllers."
     )
 
 
@@ -177,7 +177,7 @@ def _deviations(records: Records) -> Iterator[str]:
                 if c != NOMINAL
             )
             paper = percent(-PAPER[name].reduction)
-            yield f"- `{name}`: {words}. Motion with {variation}: {effects} (the paper: {paper})."
+            yield f"- `{name}`: {words}. Motion ({variation}): {effects} (the paper: {paper})."
     yield (
         "- `solo8-push` and `talos-push` do not change the robots. In all four scenarios, gains and "
         "sensors are choices."

@@ -113,9 +113,9 @@ def _predictors(records: Records) -> list[str]:
     }
     ways = ", ".join(f"{key} for {jump} jumps and {motion} motions" for key, (jump, motion) in same.items())
     return [
-        f"- **{best} predicts the jump of a contact best.** Over all points and controllers, the measured jump has "
-        f"the rank correlations {parts}. Of {count} runs, the right sign of the change against nominal is predicted "
-        f"by {ways}."
+        f"- **{best} predicts the jump of a contact best.** Rank correlations of the measured jump, over all "
+        f"points and controllers: {parts}. In {count} runs, the sign of the change against nominal is predicted "
+        f"correctly by {ways}."
     ]
 
 
@@ -193,7 +193,7 @@ def _splits(records: Records) -> Iterator[str]:
 
 def _counterexamples(records: Records) -> Iterator[str]:
     """List counterexamples, each with the command that repeats the run."""
-    yield "These compare `robust` with `nominal`. `python -m docs.studies points --only NAME --number NUMBER`"
+    yield "These runs compare `robust` with `nominal`. `python -m docs.studies points --only NAME --number NUMBER`"
     yield from ("runs one of them again.", "")
     for name, every in records.items():
         own = tried(every)
