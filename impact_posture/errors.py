@@ -267,7 +267,7 @@ class ManifestMismatch(InputError):
     def __init__(self, key: str, exported: object, found: object, *, where: str = "manifest", hint: str = "") -> None:
         self.key, self.exported, self.found = key, exported, found
         super().__init__(
-            f"{key} is {_short(exported)} in the export, {_short(found)} here",
+            f"{key} is {_short(exported)} in the export, but {_short(found)} here",
             where=where,
             hint=hint or "export again for this robot (impact-posture codegen)",
         )

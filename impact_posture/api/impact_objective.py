@@ -127,7 +127,7 @@ class ImpactObjective(WorstCaseObjective):
         super().__init__(
             robot, leading, metric, chosen, feet, compliance, normal_cone_deg, tuple(more), bilateral, variants
         )
-        # PostureProblem chooses the kind again, because the problem may state the speed.
+        # PostureProblem chooses the objective type again, because the problem may state the speed.
         object.__setattr__(self, "_stated_kind", kind)
         # A missing support is not an error, because an impact can be evaluated without supports.
         object.__setattr__(self, "_missing", missing_support(robot) if supports is None and not feet else "")
@@ -153,7 +153,7 @@ class ImpactObjective(WorstCaseObjective):
 
     @checked
     def export(self, out: str | Path, *, build: bool = True, **options: Any) -> Export:
-        """Write C code for H, its gradient and this objective into a folder, and build the library.
+        """Write C code for H, its gradient and this objective into a folder, and compile the code to a library.
 
         If the folder already contains this code, the code is not written again.
 

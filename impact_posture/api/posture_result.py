@@ -89,7 +89,7 @@ class PostureResult:
 
     @property
     def verdict(self) -> str:
-        """The first line that ``optimize`` prints; ``document["verdict"]`` has its numbers.
+        """The verdict in one line, as ``optimize`` prints it first; ``document["verdict"]`` contains its numbers.
 
         Raises:
             InputError: The objective is not an impact objective.
@@ -144,7 +144,7 @@ class PostureResult:
         compile: CompileMode = "auto",
         progress: Progress | None = None,
     ) -> PostureResult:
-        """Return this result, completed by the best objective under each of ``points`` bounds on ``against``.
+        """Return this result with the best objective under each of ``points`` bounds on ``against`` added.
 
         Args:
             points: Number of bounds.
@@ -167,11 +167,11 @@ class PostureResult:
 
     @checked
     def path(self, *, seed: ZeroOrMore = 0, strike: bool = False) -> PostureResult:
-        """Return this result, completed by a timed path from the start to the optimum.
+        """Return this result with a timed path from the initial posture to the optimum added.
 
         The timing respects the robot's limits (:func:`~impact_posture.path.posture_path.posture_path`).  If no path
-        leads to the best optimum, paths to the other optima are tried, and :attr:`answer` is the posture where the
-        path ends.  A search without ``finish_all`` may not find all optima.
+        leads to the best optimum, the method tries paths to the other optima, and :attr:`answer` is the posture where
+        the path ends.  A search without ``finish_all`` may not find all optima.
 
         Args:
             seed: Seed of the sampling planner.
@@ -280,8 +280,8 @@ def optimize(
     Args:
         problem: The problem.
         starts: Largest number of random postures that the search screens, by default 6144.  If the search is
-            ``multistart``, or the problem cannot be screened, ``starts`` is the number of starts, by default 16.  The
-            first start is then the given posture, and the others are random feasible postures.
+            ``multistart``, or the problem cannot be screened, ``starts`` is the number of starts, by default 16.  In
+            these two cases, the first start is the given posture, and all other starts are random feasible postures.
         seed: Seed of the random starts.
         jobs: Number of parallel processes.
         compile: When to compile the program: ``auto`` (if it saves time), ``always`` or ``never``.

@@ -41,7 +41,7 @@ StoredArray = Annotated[NDArray[Any], PlainValidator(_unpacked), PlainSerializer
 
 
 def cached(kind: str, key: str, cls: type[_Value], make: Callable[[], _Value]) -> _Value:
-    """Return the value of the file ``<kind>/<key>.json`` in the cache; without a valid file, make and store it.
+    """Return the value of the file ``<kind>/<key>.json`` in the cache; without a valid file, compute and store it.
 
     ``cls`` is the type of the value: a dataclass, or a tuple of dataclasses.  ``make`` computes the value.  If the
     cache cannot be written, the value is returned without being stored.

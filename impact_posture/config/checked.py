@@ -96,7 +96,7 @@ def hint_for(value: object, annotation: Any) -> str:
         parts = _alternatives(get_args(annotation))
         if any(_fits(value, part) for part in parts):
             return ""
-        # If the value has the type of an alternative, the Demand of this alternative gives the hint.
+        # If the value has the type of one alternative of a union, the Demand of this alternative gives the hint.
         close = [part for part in parts if get_origin(part) is Annotated and _fits(value, get_args(part)[0])]
         return hint_for(value, close[0]) if close else f"give {_words(annotation)}"
     base, *demands = get_args(annotation) if get_origin(annotation) is Annotated else (annotation,)
@@ -137,7 +137,7 @@ def _fits(value: object, annotation: Any) -> bool:
         if isinstance(value, str | bytes | Mapping) or not isinstance(value, Collection):
             return False
         if (isinstance(value, np.ndarray) and value.ndim == 0) or (isinstance(value, Set) and parts[0] is float):
-            # An array without axes has no entries, and the entries of a set have no order.
+            # Neither an array without axes nor a set is a sequence.
             return False
         if origin is tuple and parts[-1] is not ...:
             return len(value) == len(parts) and all(map(_fits, value, parts))

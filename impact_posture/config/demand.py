@@ -53,7 +53,7 @@ class Demand:
 
 
 def between(low: float, high: float, unit: str = "", names: Sequence[str] = ()) -> Demand:
-    """Return the demand that a value is a number within bounds, or one of several names."""
+    """Return a :class:`Demand` for numbers from ``low`` to ``high``, or one of several names."""
     named = f", or one of {', '.join(names)}" if names else ""
     return Demand(
         lambda value: value in names if isinstance(value, str) else low <= value <= high,
@@ -62,7 +62,7 @@ def between(low: float, high: float, unit: str = "", names: Sequence[str] = ()) 
 
 
 def kind_or_tilt(kinds: Sequence[str], tilted: str) -> Demand:
-    """Return the demand that a text is one of ``kinds`` or, for ``tilted="level"``, a text such as ``level:10``."""
+    """Return a :class:`Demand` for one of ``kinds`` or, with ``tilted="level"``, a text such as ``level:10``."""
 
     def holds(value: str) -> bool:
         if value in kinds or value.startswith(f"{tilted}:"):

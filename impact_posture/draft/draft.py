@@ -33,7 +33,7 @@ _POSES = ((7, "full"), (6, "aligned"), (4, "position"), (0, "free"))
 _SPEED = 100.0
 # The draft sets ``com_over_feet`` only if the center of mass is at least this far (m) inside the support polygon.
 _LEAST_DEPTH = 0.02
-# Feet whose heights differ by less than this (m) are at the same height.
+# Feet whose heights differ by less than this value (m) are treated as level.
 _UNEVEN = 1e-3
 
 
@@ -122,7 +122,7 @@ def _header(robot: Robot, feet: Sequence[str]) -> Draft:
             f"Data of {robot.name} that its {_file(robot, 'URDF')} cannot hold, drafted by impact-posture inspect "
             "--write-robot-toml. "
             "GUESS marks values from names and geometry alone: check them before you trust a result. This file is "
-            "read as robot.toml in the folder of that file, or by --config."
+            f"read if it is robot.toml in the folder of the {_file(robot, 'URDF')}, or if --config names it."
         )
     )
     draft.lines.append(f'schema = "{SCHEMA}"')
@@ -259,7 +259,7 @@ def _constraints(draft: Draft, robot: Robot, feet: Sequence[Support], carrying: 
     if feet:
         depth = _support_depth(robot, feet)
         if depth > _LEAST_DEPTH:
-            keys.key("com_over_feet", True, f"at the default posture it is {depth:.2g} m inside", guessed=True)
+            keys.key("com_over_feet", True, f"{depth:.2g} m inside at the default posture", guessed=True)
             keys.key("com_margin", 0.01, "m, our choice", guessed=True)
         else:
             keys.lines += comment_lines(
@@ -317,7 +317,7 @@ def _propulsion(draft: Draft, robot: Robot) -> None:
     to_base = data.oMf[robot.frame_id(base)].inverse()
     hubs = {link: to_base * data.oMf[robot.frame_id(link)] for link in links}
     center = np.mean([hub.translation for hub in hubs.values()], axis=0)
-    # Neighbors around the center turn in opposite directions.
+    # Propellers next to each other around the center turn in opposite directions.
     around = sorted(links, key=lambda link: np.arctan2(*(hubs[link].translation - center)[1::-1]))
     coefficient = 2 * robot.mass * gravity / len(links) / _SPEED**2
     lines = [

@@ -1,4 +1,4 @@
-"""Compare the contact point of an impact with the foremost point of its links, which touches a surface first."""
+"""Compare a contact point with the foremost point of the links around it, which touches a surface first."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_spec import Support
 from impact_posture.system.arrays import Array
 
-# A link that reaches less than this (m) beyond its contact point is not reported.
+# A link that reaches less than this value (m) beyond its contact point is not reported.
 BEYOND = 5e-3
 
 

@@ -202,7 +202,7 @@ class ResolvedImpact:
         return early_touches(self.robot, self.objective.contacts, q, self.held)
 
     def touch_warnings(self, q: Array, remedy: str) -> list[str]:
-        """Return a warning for each of :meth:`early_touches`, with a setting that prevents it (``remedy``)."""
+        """Return a warning for each of :meth:`early_touches`; ``remedy`` is a setting that prevents early touches."""
         # A single option `offset` cannot move several contact points.
         alone = not self.objective.others
         touches = self.early_touches(q)

@@ -32,7 +32,7 @@ def least_compliance(robot: Robot) -> float:
     """Return the least compliance ε, 1/kg, that the symbolic kernel and the C export allow.
 
     Kernel and C code add ``1/ε`` to the inertia of the feet, and subtract it again on the path to the base.  The
-    difference has a rounding error proportional to ``1/ε``.  At this limit, about eight digits are correct.
+    difference has a rounding error proportional to ``1/ε``.  At the least compliance, about eight digits are correct.
     """
     return _LEAST_COMPLIANCE / robot.mass
 

@@ -20,7 +20,7 @@ from impact_posture.robot.robot_spec import PropulsionSpec
 from impact_posture.system.arrays import Array
 
 _RESIDUAL = 1e-6
-"""Largest unbalanced base force or moment (N, N·m) that still counts as equilibrium."""
+"""Largest unbalanced force or moment on the base (N, N·m) that is treated as equilibrium."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Hover:
     torque_margin: float
     """Smallest ``1 - |τ|/τ_max`` of all joints; 1 without joints."""
     residual: float
-    """Largest base force or moment (N, N·m) that the rotors leave unbalanced."""
+    """Largest entry of the base wrench (N, N·m) that the rotors do not balance."""
     violations: tuple[str, ...]
     """Reasons why the robot cannot hover in this posture; empty if it can."""
 
@@ -86,8 +86,8 @@ def thrust_limits(propulsion: PropulsionSpec) -> tuple[float, float]:
 def torque_limits(model: pin.Model) -> Array:
     """Return the largest torque of each velocity entry, N·m or N, shape (nv,).
 
-    The torque is infinite for a floating base and for a locked joint (infinite armature).  It is also infinite for a
-    joint whose limit is zero, because zero means that the file states no limit.
+    The torque is infinite for a floating base and for a locked joint (infinite armature).  The torque is also
+    infinite for a joint whose limit is zero, because zero means that the file states no limit.
     """
     limits = np.array(model.effortLimit, dtype=float)
     unknown = ~(np.isfinite(limits) & (limits > 0)) | finite_armature(model)[1]
@@ -224,7 +224,7 @@ def lateral_force_range(model: pin.Model, propulsion: PropulsionSpec, q: ArrayLi
 
 
 def _centred_thrusts(matrix: Array, wrench: Array, low: float, high: float) -> Array:
-    """Solve ``A f = w`` for the thrusts farthest from their limits; without a solution, by bounded least squares."""
+    """Solve ``A f = w`` for the thrusts farthest from their limits; if impossible, by bounded least squares."""
     count = matrix.shape[1]
     if count == 6 and np.linalg.matrix_rank(matrix) == 6:
         return np.asarray(np.linalg.solve(matrix, wrench))

@@ -53,7 +53,7 @@ def set_armature(model: pin.Model, spec: RobotSpec, srdf: Path | None, option: A
 
 
 def armature_warning(model: pin.Model, source: str, held: Sequence[str]) -> tuple[str, ...]:
-    """Return a warning about joints without armature, except the joints ``held``; empty without such joints."""
+    """Return a warning about joints without armature, except the joints ``held``; empty if there are none."""
     armature = np.asarray(model.armature)
     counted = {i: str(model.names[i]) for i in joint_range(model) if model.names[i] not in held}
     bare = [name for i, name in counted.items() if not (armature[v_slice(model, i)] > 0).any()]

@@ -31,7 +31,7 @@ _SENSOR = re.compile(
 )
 _FLYING = re.compile(r"fly|copter|drone|uav|aerial|quadrotor|hexarotor|propeller", re.I)
 
-# Words in the names of start postures, best first.
+# Words in the names of postures from which a search should start, best first.
 _STARTS = ("stand", "half_sitting", "home", "ready", "default", "homing", "up")
 # Largest height of a foot above the lowest point of the robot, relative to the robot's height.
 _LEVEL = 0.1
@@ -153,7 +153,7 @@ def wheels(robot: Robot) -> tuple[str, ...]:
 
 
 def propellers(robot: Robot) -> tuple[str, ...]:
-    """Return at least three links on the base, or on joints of the base, with a name like "rotor" or "prop".
+    """Return the links on the base, or on joints of the base, with a name like "rotor" or "prop", if at least three.
 
     The result is empty for legged robots, whose links with "rotor" in the name are the rotors of motors.
     """
@@ -180,7 +180,7 @@ def srdf_near(urdf: Path) -> Path | None:
 
 
 def srdf_end_effectors(srdf: Path | None) -> Mapping[str, str]:
-    """Return end-effector link → attribute values, as lower-case text, from the SRDF."""
+    """Return the end-effector links in an SRDF → values of all attributes, as lower-case text."""
     tags = read_srdf(srdf).iter("end_effector") if srdf is not None else ()
     return {tag.get("parent_link", ""): " ".join(tag.attrib.values()).lower() for tag in tags}
 
@@ -195,7 +195,7 @@ def likely_root(robot: Robot, feet: Sequence[str], srdf: Path | None) -> tuple[R
         return "free-flyer", "it has no joints"
     if flies(robot):
         return "free-flyer", "its names say that it flies"
-    return "fixed", 'nothing says that its base moves; "free-flyer" if it does'
+    return "fixed", 'nothing says that its base moves; write "free-flyer" if it does'
 
 
 def likely_kind(robot: Robot, feet: Sequence[str]) -> tuple[str, str]:

@@ -13,22 +13,22 @@ from impact_posture.errors import InertiaError
 from impact_posture.robot.model_joints import v_slice
 from impact_posture.robot.robot import Robot
 
-# A mass (kg) or moment of inertia (kg m²) below this is treated as zero.
+# A mass (kg) or moment of inertia (kg m²) below this value is treated as zero.
 _TINY = 1e-10
-# Products of entries of a mass matrix overflow if the entries are larger than this.
+# Products of entries of a mass matrix overflow if the entries are larger than this value.
 _LARGEST = 1e100
 # Relative violation of the triangle inequality that is treated as a rounding error.
 _TRIANGLE_SLACK = 1e-3
 # A mass matrix, scaled to unit diagonal, is singular if the smallest eigenvalue is below this fraction of the largest
-# eigenvalue.  The smallest ratio of the known robots is above 1e-3.
+# eigenvalue.  For all known robots, the ratio of the two is above 1e-3.
 _SINGULAR = 1e-12
 
 
 def check_inertias(root: ET.Element, model: pin.Model, path: Path, accept: bool) -> tuple[str, ...]:
     """Raise an error for links with impossible masses or inertias; return warnings.
 
-    An error becomes a warning if ``accept`` is true, or if it is negligible compared with the inertia of the body
-    that contains the link.
+    If ``accept`` is true, or if the fault is negligible compared with the inertia of the body that contains the link,
+    a warning replaces the error.
 
     Raises:
         InertiaError: A mass is negative, a link without mass has moments, or moments break the triangle inequality.
@@ -128,7 +128,7 @@ def check_mass_matrix(robot: Robot, where: str) -> None:
 
 
 def _link_fault(link: ET.Element, where: str) -> tuple[float, str] | None:
-    """Return the size (kg m²) and a description of the error in the inertia of a link, if there is any."""
+    """Return the fault in the inertia of a link: its size (kg m²) and its description; ``None`` without a fault."""
     inertial, name = link.find("inertial"), link.get("name", "?")
     if inertial is None:
         return None

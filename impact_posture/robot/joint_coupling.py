@@ -32,7 +32,7 @@ class JointCoupling:
 
 
 def composed(stated: Mapping[str, JointCoupling], where: str) -> tuple[JointCoupling, ...]:
-    """Return couplings in which no leader is a follower, for couplings by the name of the follower.
+    """Return equal couplings in which no leader is a follower; the keys of ``stated`` are names of followers.
 
     Raises:
         UrdfError: Joints follow each other in a circle.
@@ -111,7 +111,7 @@ def present(couplings: Iterable[JointCoupling], model: pin.Model) -> tuple[Joint
 
 
 def with_partners(couplings: Iterable[JointCoupling], joints: Collection[str]) -> tuple[str, ...]:
-    """Return ``joints`` and all joints that cannot move without them."""
+    """Return ``joints`` and all joints that are coupled to them."""
     chosen = dict.fromkeys(joints)
     leaders = {c.leader for c in couplings if chosen.keys() & {c.follower, c.leader}}
     partners = (joint for c in couplings if c.leader in leaders for joint in (c.leader, c.follower))
@@ -121,7 +121,7 @@ def with_partners(couplings: Iterable[JointCoupling], joints: Collection[str]) -
 def couple_limits(model: pin.Model, couplings: Iterable[JointCoupling]) -> list[str]:
     """Let position and velocity limits of followers bound their leaders; return warnings.
 
-    A follower without a range (equal limits) has no limits.
+    Equal limits of a follower are treated as missing limits.
     """
     warnings = []
     low, high = model.lowerPositionLimit.copy(), model.upperPositionLimit.copy()

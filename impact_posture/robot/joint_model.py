@@ -65,7 +65,7 @@ def transmissions(robot: Robot) -> Transmissions:
 
 
 def with_joint_model(robot: Robot, joint_model: JointModel) -> Robot:
-    """Return the robot with the armature of a joint model.
+    """Return a copy of the robot whose armature belongs to the joint model ``joint_model``.
 
     - ``reflected`` keeps the armature at all joints.
     - ``link`` removes the armature, except at joints with a ``rigid`` transmission.

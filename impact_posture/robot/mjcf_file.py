@@ -33,7 +33,7 @@ _HEAD = 50_000
 # bodies, and four times as long for twice as many.  MuJoCo crashes if a height field does not fit into memory.
 _MOST = 5_000
 _COUNT = re.compile(rb"""\b(?:nrow|ncol|count)\s*=\s*["']\s*(\d{1,9})""")
-# Processor time of the compiler, s.  It needs 2 s for 10,000 bodies.
+# Processor time of the compiler, s.  The compiler needs 2 s for 10,000 bodies.
 _SECONDS = 30.0
 _UTF_16 = codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE
 # Fields of a compiled model that must be finite.
@@ -52,9 +52,9 @@ class MjcfFile(NamedTuple):
 
     Attributes:
         model: The ``mujoco.MjModel`` with the chosen root.
-        keyframes: Name of a keyframe → name of a joint → its entries in ``qpos``.
+        keyframes: Name of a keyframe → name of a joint → entries of the joint in ``qpos``.
         couplings: Couplings of joints by equality constraints.
-        notes: Warnings about content that has no effect here, one line each.
+        notes: Warnings about content of the MJCF that is ignored, one line each.
     """
 
     model: Any
@@ -156,7 +156,7 @@ def _compile(spec: Any, path: Path) -> tuple[Any, list[str]]:
         body = geom.parent
         if body.name != "world" and not (body.explicitinertial and spec.compiler.inertiafromgeom != _FROM_GEOMS):
             fault = f"no mesh '{name}', and body '{body.name}' takes its inertia from the mesh"
-            raise MjcfError(fault, where=str(path), hint="add the mesh, or state <inertial>")
+            raise MjcfError(fault, where=str(path), hint="add the mesh file, or state <inertial>")
         spec.delete(geom)
     for part in (*(asset for asset in assets if asset.name in missing), *spec.skins):
         spec.delete(part)
@@ -231,7 +231,7 @@ def _check_tree(model: Any, path: Path) -> None:
 
 
 def _tendon_terms(model: Any, k: int) -> dict[int, float]:
-    """Return joint → factor ``c`` for a tendon equality ``Σ c (q − q⁰) = a₀`` of up to two joints, else nothing."""
+    """Return joint → factor ``c`` for a tendon equality ``Σ c (q − q⁰) = a₀`` of up to two joints; else empty."""
     mujoco, terms = import_mujoco(), dict[int, float]()
     curved = model.eq_obj2id[k] >= 0 and model.eq_data[k, 2:5].any()
     if curved or not model.eq_type[k] == mujoco.mjtEq.mjEQ_TENDON:
@@ -295,7 +295,7 @@ def _coupling_armatures(model: Any) -> Iterator[str]:
 
 
 def _left_out(model: Any) -> Iterator[str]:
-    """Yield one line that counts the parts of the file that the impact model leaves out, if there are any."""
+    """Yield a line that names and counts the contents of the file that the impact model ignores, if any."""
     mujoco = import_mujoco()
     balls = (model.jnt_type == mujoco.mjtJoint.mjJNT_BALL) & (model.jnt_limited > 0)
     tendons = (model.tendon_stiffness > 0) | (model.tendon_limited > 0) | (model.tendon_damping > 0)

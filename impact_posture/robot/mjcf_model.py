@@ -82,7 +82,7 @@ def configuration(model: pin.Model, mjcf: Any, entries: Mapping[str, Array] | No
 
 
 def _joint(mjcf: Any, j: int, *, endless: bool) -> tuple[pin.JointModel, pin.SE3, pin.SE3]:
-    """Return the type of a joint, its placement in its body at ``qpos0``, and the placement of the body after it."""
+    """Return a joint, its placement in its body at ``qpos0``, and the placement of the body in the joint frame."""
     types, axis = import_mujoco().mjtJoint, np.array(mjcf.jnt_axis[j])
     shift = pin.SE3(np.eye(3), np.array(mjcf.jnt_pos[j]))
     if mjcf.jnt_type[j] == types.mjJNT_BALL:
@@ -96,7 +96,8 @@ def _joint(mjcf: Any, j: int, *, endless: bool) -> tuple[pin.JointModel, pin.SE3
     if axis.max() == 1.0:
         kind = getattr(pin, f"JointModel{family}{'XYZ'[int(axis.argmax())]}")()
     elif family == "RUB":
-        # Pinocchio has no constructor for an unbounded joint about any axis, so the z axis of the joint is the axis.
+        # Pinocchio has unbounded joints only about coordinate axes, so the joint frame is turned until z is the joint
+        # axis.
         turn = pin.SE3(pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), axis).matrix(), np.zeros(3))
         return pin.JointModelRUBZ(), shift * back * turn, turn.inverse() * shift.inverse()
     else:

@@ -12,7 +12,7 @@ import pinocchio as pin
 from impact_posture.robot.joint_coupling import JointCoupling
 from impact_posture.system.arrays import Array
 
-# Smaller numbers in rotation matrices and inertias (SI units) are rounding errors of zero.
+# Smaller numbers in rotation matrices and inertias (SI units) are treated as zero.
 _ROUNDING = 1e-14
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from impact_posture.errors import JointNotFound, PostureError, degrees_hint
 
-# A position limit larger than this counts as missing.  Pinocchio writes "no limit" as the largest double.
+# A position limit larger than this value is treated as missing.  Pinocchio writes "no limit" as the largest double.
 ENDLESS = 1e10
 
 
@@ -35,7 +35,7 @@ JOINT_ENTRIES = {
 
 
 def joint_family(joint: pin.JointModel) -> str:
-    """Return the family of a joint, a key of :data:`JOINT_ENTRIES`, or the name of its type for all other types."""
+    """Return the family of a joint (a key of :data:`JOINT_ENTRIES`); for other joints, the name of the type."""
     short = str(joint.shortname()).removeprefix("JointModel")
     return _FAMILIES.get(short, short)
 
@@ -85,7 +85,7 @@ def scalar_entries(model: pin.Model, index: int, value: float, where: str) -> tu
 
 
 def scalar_value(model: pin.Model, index: int, q: NDArray[np.float64]) -> float:
-    """Return the value of a joint with one degree of freedom at ``q``, shape (nq,); inverse of scalar_entries."""
+    """Return the value of a joint with one degree of freedom at ``q``; inverse of :func:`scalar_entries`."""
     entries = q[q_slice(model, index)]
     return float(entries[0] if entries.size == 1 else math.atan2(entries[1], entries[0]))
 
@@ -112,7 +112,7 @@ def immovable_joints(model: pin.Model) -> list[str]:
 
 
 def rigid_groups(model: pin.Model, held: Sequence[str]) -> list[int]:
-    """Return the group number of each joint; links of one group form one body while the ``held`` joints rest."""
+    """Number the joints so that links with equal numbers form a rigid body if the ``held`` joints rest."""
     group = list(range(model.njoints))
     for joint in range(1, model.njoints):
         if model.names[joint] in held:

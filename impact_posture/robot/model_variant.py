@@ -39,7 +39,7 @@ class ModelVariant:
     payload: Payload | None = None
 
     def to_dict(self) -> dict[str, object]:
-        """Return the content for JSON."""
+        """Return the fields of the variant for JSON."""
         return {
             "name": self.name,
             "armature_factor": self.armature_factor,

@@ -1,4 +1,4 @@
-"""Read postures that users give by name, in ``posture.json``, by joint names, or as ``sensor_msgs/JointState``."""
+"""Read postures: by name, or from ``posture.json``, joints by name, or a ``sensor_msgs/JointState``."""
 
 from __future__ import annotations
 

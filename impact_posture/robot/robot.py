@@ -42,7 +42,7 @@ CONVENTION = (
 )
 FIXED_CONVENTION = "q = [joints]; v = [joint rates]; SI units, radians"
 
-# A joint that exceeds a position limit by less than this (rad, m) is treated as if it were at the limit.
+# A joint that exceeds a position limit by less than this value (rad, m) is treated as if it were at the limit.
 _ON_LIMIT = 1e-6
 # In a posture, the position of a follower may differ by this value (rad, m) from the position that its leader
 # requires.  For example, the numbers of the posture may be rounded.
@@ -71,7 +71,7 @@ class CompiledMjcf:
     Attributes:
         model: The ``mujoco.MjModel`` with all joints; treat it as read-only.
         joints: The ``pin.Model`` with all joints, in the order of ``model``.
-        start: Default posture of all joints, shape (nq,); joints that the robot locks stay here.
+        start: Default posture of all joints, shape (nq,); joints that the robot locks keep these positions.
     """
 
     model: Any
@@ -201,7 +201,7 @@ class Robot:
 
     @cached_property
     def projector(self) -> Array:
-        """Projector onto the velocities that an impact can cause: coupled, zero at locked joints, shape (nv, nv)."""
+        """Projector onto the velocities that couplings and locked joints allow in an impact, shape (nv, nv)."""
         return np.asarray(self.coupling_matrix * np.isfinite(self.model.armature))
 
     @cached_property
@@ -211,7 +211,7 @@ class Robot:
 
     @property
     def held(self) -> tuple[str, ...]:
-        """Joints that robot.toml holds at their values, without locked joints."""
+        """Joints that robot.toml holds at constant positions, except locked joints."""
         return tuple(joint for joint in self.spec.constraints.hold if joint not in self.locked)
 
     @property
@@ -224,7 +224,7 @@ class Robot:
         return [k for joint in joints for k in range(self.nv)[v_slice(self.model, self.joint_id(joint))]]
 
     def fixed_with(self, hold: Sequence[str]) -> tuple[str, ...]:
-        """Return ``hold``, the joints with equal position limits, and all joints that are coupled to them."""
+        """Return ``hold``, the joints with equal position limits, and all joints that are coupled to any of these."""
         return with_partners(self.couplings, (*hold, *immovable_joints(self.model)))
 
     @property
@@ -251,7 +251,7 @@ class Robot:
 
     @cached_property
     def impact_sha256(self) -> str:
-        """Hash like :attr:`model_sha256`, but with ``model.armature``, which depends on the joint model."""
+        """Like :attr:`model_sha256`, but with ``model.armature``, which depends on the joint model."""
         return dynamics_hash(self.model, np.asarray(self.model.armature), self.couplings)
 
     @cached_property
@@ -319,7 +319,7 @@ class Robot:
 
     @property
     def upright(self) -> Array | None:
-        """World z axis at the default posture in base axes, shape (3,); ``None`` for a fixed base."""
+        """World z axis in base axes, at the default posture, shape (3,); ``None`` for a fixed base."""
         return pin.Quaternion(self.posture()[3:7]).matrix()[2].copy() if self.floating else None
 
     @checked
@@ -351,7 +351,7 @@ class Robot:
         return coupled(self.model, self.couplings, q)
 
     def _check_coupled(self, q: Array, where: str) -> Array:
-        """Return ``q`` with exact positions of followers; raise an error if a position differs clearly."""
+        """Return ``q`` with exact positions of followers; raise an error if they differ by more than ``_COUPLED``."""
         exact = self.coupled(q)
         for c in self.couplings:
             index = self.model.idx_qs[self.model.getJointId(c.follower)]

@@ -20,7 +20,7 @@ from impact_posture.system.progress import tell
 
 _MENAGERIE, _DESCRIPTIONS = "menagerie:", "robot_descriptions:"
 COLLECTIONS = (EXAMPLE_PREFIX, _MENAGERIE, _DESCRIPTIONS)
-"""Beginnings of the names of robots in collections."""
+"""Prefixes of the names of robots in collections."""
 
 _EXTRA = "robots"
 
@@ -62,7 +62,7 @@ def ways_to_name() -> tuple[str, ...]:
 
 
 def names_with(text: str) -> list[str]:
-    """Return the names of robots in the installed collections that contain a text."""
+    """Return the names in the installed collections that contain ``text``."""
     names = [EXAMPLE_PREFIX + path for path in example_models() if text.casefold() in Path(path).stem.casefold()]
     with suppress(ImportError):
         names += [_MENAGERIE + name for name in import_module("mujoco_menagerie").names() if text in name]

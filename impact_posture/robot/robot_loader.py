@@ -116,7 +116,7 @@ def build_robot(located: Located, options: LoadOptions) -> Robot:
 
 
 def names_a_path(robot: str, folder: Path) -> bool:
-    """Return whether ``robot`` is a path (from ``folder``), not a known name or a robot of a collection."""
+    """Return whether ``robot`` is a path (from ``folder``), and not the name of a known or collected robot."""
     if robot.startswith(COLLECTIONS) or robot in known_robots():
         return False
     return robot.endswith((".urdf", ".xml", ".xacro")) or "/" in robot or os.path.isfile(folder / robot)
@@ -196,7 +196,7 @@ def locate(robot: str, options: LoadOptions) -> Located:
 
 
 def _stored(robot: str) -> CollectedRobot:
-    """Return the files of a robot that is not a known name."""
+    """Return the files of a robot given by a path, a URI or a name in a collection."""
     if robot.startswith(EXAMPLE_PREFIX):
         return CollectedRobot(resolve_path(robot, Path()))
     if robot.startswith(COLLECTIONS):
@@ -221,7 +221,7 @@ def _package_folders(spec: RobotSpec, options: LoadOptions, base: Path, name: st
 
 
 def _srdf_path(spec: RobotSpec, options: LoadOptions, base: Path, stored: str | None) -> Path | None:
-    """Return the SRDF of a robot, or ``None``; raise ``UrdfError`` if the file is absent."""
+    """Return the SRDF of a robot, or ``None``; raise ``UrdfError`` if a stated file does not exist."""
     text = options.srdf or spec.model.srdf or stored
     if text is None:
         return None
@@ -265,7 +265,7 @@ def _override_limits(model: pin.Model, spec: RobotSpec, name: str) -> None:
 
 
 def _check_names(model: pin.Model, source: str) -> None:
-    """Raise an error if two joints or two links have the same name, because the name could select the wrong one."""
+    """Raise an error if two joints or two links have the same name, because a name must identify them."""
     links = [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
     for kind, names in (("joints", list(model.names)), ("links", links)):
         name, count = Counter(names).most_common(1)[0] if names else ("", 0)

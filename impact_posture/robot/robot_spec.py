@@ -96,7 +96,7 @@ class Support(_Table):
 
 @dataclass(frozen=True)
 class ConstraintSpec(_Table):
-    """Default constraints of optimizations with this robot."""
+    """Default constraints of optimizations with the robot."""
 
     hold: tuple[str, ...] = ()
     level_base: bool = False

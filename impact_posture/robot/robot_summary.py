@@ -113,7 +113,7 @@ def _posture(robot: Robot, name: str) -> dict[str, Any]:
 def _actuation(robot: Robot, propulsion: PropulsionSpec) -> dict[str, Any]:
     """Return the rank and the condition of the allocation, and lateral force and hover at each posture.
 
-    The condition number is ``None`` if the rank is below 6.  The force is ``None`` if the base is not level.
+    The condition number is ``None`` if the rank is below 6.  The lateral force is ``None`` if the base is not level.
     """
     model = robot.model
     rotors = allocation(model, propulsion)

@@ -8,7 +8,7 @@ import numpy as np
 
 from impact_posture.system.arrays import Array, nonnegative_least_squares
 
-# A point within the distance ``ON_LINE`` (m) of a line counts as on the line.  Edges are rounded to ``_DIGITS``
+# A point within the distance ``ON_LINE`` (m) of a line is treated as on the line.  Edges are rounded to ``_DIGITS``
 # decimals.
 ON_LINE, _DIGITS = 1e-9, 12
 
@@ -45,7 +45,7 @@ def polygon_edges(points: Iterable[Array]) -> tuple[Array, Array] | None:
     places = np.array(list(points), dtype=float).reshape(-1, 2)
     corners = [places[k] for k in convex_ring(places)]
     while len(corners) > 2:
-        # A corner of the hull near the line through its neighbors lies between them.
+        # If a corner of the hull is near the line through its neighbors, the corner lies between the neighbors.
         around = zip(np.roll(corners, 1, axis=0), np.roll(corners, -1, axis=0), corners, strict=True)
         heights = [_height(*points) for points in around]
         if min(heights) >= ON_LINE:

@@ -23,7 +23,7 @@ from impact_posture.robot.joint_coupling import JointCoupling, urdf_couplings
 from impact_posture.robot.urdf_joints import clear_negative_limits, correct_joints
 from impact_posture.system.text_files import read_bytes
 
-# pin.Data always contains 6 nv³ numbers: 0.4 GB at 200 degrees of freedom, and 48 GB at 1,000.
+# pin.Data always contains 6 nv³ numbers.  This is 0.4 GB for 200 degrees of freedom, and 48 GB for 1,000.
 MOST_DEGREES_OF_FREEDOM = 200
 # Largest coordinate of an origin, m.  Doubles do not resolve micrometers at greater distances, and hulls fail there.
 FARTHEST = 1e10
@@ -188,7 +188,7 @@ def _read(path: Path) -> tuple[str, ET.Element]:
         raise UrdfError(fault, where=str(path), hint="expand xacro first, or give the .urdf")
     if root.find("link") is None:
         raise UrdfError("has no <link>", where=str(path), hint="expand xacro first, or give the .urdf")
-    # The search in the elements takes longer than the search in the text.
+    # Search the elements only if the text contains a sign of xacro, because this search takes longer.
     if ("$" in text or "<xacro:" in text) and (leftover := _xacro_leftover(root)):
         fault = f"contains {leftover}, which only xacro can evaluate"
         hint = "name the file .xacro"
@@ -228,7 +228,7 @@ def _xml_text(path: Path) -> str:
 
 
 def _xacro_leftover(root: ET.Element) -> str:
-    """Return the first xacro element, or else the first number that is a xacro expression; empty without them."""
+    """Return the first xacro element, or else the first number that is a xacro expression; else an empty text."""
     for element in root:
         if element.tag.startswith("xacro:"):
             return f"<{element.tag}>"
@@ -243,7 +243,7 @@ def _xacro_leftover(root: ET.Element) -> str:
 def quiet_stderr() -> Iterator[list[str]]:
     """Hide the error output of C++ libraries; after the block, the yielded list contains its first error line."""
     errors = [""]
-    # Prefer a file in memory, because possibly no folder is writable.
+    # Prefer a file in memory, because there may be no writable folder.
     in_memory = hasattr(os, "memfd_create")
     with os.fdopen(os.memfd_create("stderr"), "w+b") if in_memory else tempfile.TemporaryFile() as sink:
         saved = os.dup(2)

@@ -15,7 +15,8 @@ from impact_posture.system.arrays import Array
 
 # Types of joints that have an axis.
 _WITH_AXIS = ("revolute", "continuous", "prismatic", "planar")
-# A continuous joint should be revolute if its stated range is shorter than a turn by more than this, rad.
+# If the stated range of a continuous joint is shorter than a turn by more than this value, rad, warn that the joint
+# should be revolute.
 _SHORT_OF_A_TURN = 0.01
 
 
@@ -67,8 +68,8 @@ def correct_joints(root: ET.Element, model: pin.Model, path: Path) -> tuple[str,
 def _turn_planar(model: pin.Model, index: int, axis: Array) -> None:
     """Make ``axis`` (link axes) the normal of a planar joint; the planar joint of Pinocchio has the normal z.
 
-    The joint frame is turned by the smallest rotation R from z to the axis.  Everything on the link is turned back,
-    so that links and frames stay where the URDF places them.
+    The joint frame is turned by the smallest rotation R from z to the axis.  The link and its frames are turned back,
+    so that they stay where the URDF places them.
     """
     turn = pin.SE3(pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), axis).matrix(), np.zeros(3))
     back = turn.inverse()
@@ -82,7 +83,7 @@ def _turn_planar(model: pin.Model, index: int, axis: Array) -> None:
 
 
 def _short_range(joint: ET.Element) -> str:
-    """Return the stated position range of a joint as text if it is shorter than a turn, otherwise an empty text."""
+    """Return the position range of a joint as text if the range is shorter than a turn; else an empty text."""
     limit = joint.find("limit")
     stated = "" if limit is None else f"{limit.get('lower', '')} {limit.get('upper', '')}"
     low, high = finite_numbers(stated, 2) or (0.0, 0.0)

@@ -44,7 +44,7 @@ class _Arguments(dict[str, str]):
 
 
 class _Packages:
-    """Folders of packages: in ``known`` by name, in one of ``folders``, in a folder above ``path``, or from ROS."""
+    """Folders of packages: from ``known``, in one of ``folders``, in a folder above ``path``, or from ROS."""
 
     def __init__(self, path: Path, folders: Sequence[Path], known: Mapping[str, str]) -> None:
         self._path, self._places, self._known = path, [*folders, *path.absolute().parents], known
@@ -123,12 +123,12 @@ def expand_xacro(
 
 
 def _expanded(path: Path, values: _Arguments, packages: _Packages) -> tuple[str, set[str]]:
-    """Return the text of the URDF, and the names of the arguments that the file knows."""
+    """Return the text of the URDF, and the names of all arguments that the xacro file has."""
     xacro = import_extra("xacro", "robots")
     try:
         with packages.indexed():
             return xacro.process_file(str(path), mappings=values).toxml(), values.known
-    except Exception as error:  # Expressions raise any error.
+    except Exception as error:  # Python expressions in the file may raise any error.
         cause = error
         while isinstance(cause, xacro.XacroException) and isinstance(cause.exc, Exception):
             cause = cause.exc

@@ -9,8 +9,9 @@ and the normal force reach their maxima; the largest force is F:
 - contact of known T: treated as the linear contact with this T, ``F = (π/2) mv/T``.
 
 The mass is ``m = nᵀp/v`` with the impulse p of the plastic impact at the friction of the contact
-(:mod:`impact_posture.impact.friction.coulomb_impact`).  This mass is exact.  While the normal force grows, the point
-sticks or slides along one constant direction, so the friction force is proportional to the normal force.
+(:mod:`impact_posture.impact.friction.coulomb_impact`).  While the normal force grows, the point sticks or slides
+along one constant direction.  The friction force is therefore proportional to the normal force, and the mass ``m`` is
+exact.
 
 The ratio ``x = T/√(m C)`` determines whether the rotors behind elastic transmissions respond to the impact.  The
 denominator ``√(m C)`` is the response time of the joint springs.  Here ``m`` is the mass for the links alone, and ``C
@@ -145,7 +146,7 @@ class Compression:
     Attributes:
         contact: Elasticity of the contact; ``None`` if not known.
         mass: Effective mass m with friction, kg: normal impulse per approach speed.  The joint model of the objective
-            determines the inertia.
+            determines whether rotors are included.
         time: Compression time T, s, of the mass ``mass``; ``None`` if not known.
         peak_force: Largest normal force F, N, of the mass ``mass``; ``None`` if not known.
         x: Ratio ``T/√(m C)``, with T and m of the links alone; ``None`` if the contact or the springs are unknown.

@@ -80,7 +80,7 @@ class ContactStability(JsonBlock):
 
 
 def contact_stability(oracle: ImpactOracle, supports: tuple[Support, ...], q: Array) -> ContactStability:
-    """Compute support impulses at ``q``, shape (nq,), within the friction cones or, if there are none, of least pull.
+    """Compute support impulses at ``q``, shape (nq,), within the friction cones or, if impossible, of least pull.
 
     The ground is level, so the axis of every cone is world z.  A sole with a ``size`` transmits moments until its
     center of pressure reaches an edge.

@@ -28,7 +28,7 @@ _RANK = 1e-9
 _STEPS = 10
 # The numeric iteration ends after this number of steps.
 _MOST_STEPS = 60
-# The numeric iteration also ends at a step of this relative size.
+# The numeric iteration also ends if the relative size of a step is below this value.
 _ROUNDING = 1e-15
 # A friction coefficient below this value is regarded as zero.
 NO_FRICTION = 1e-15
