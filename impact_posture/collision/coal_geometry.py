@@ -46,7 +46,7 @@ def load_geometry(robot: Robot, described: list[LinkShape]) -> Geometry:
     model, largest = robot.model, largest_extent(robot)
     kept, solids, warnings = [], [], []
     read_meshes(shape.mesh for shape in described if shape.mesh is not None)
-    # Several limbs can share a mesh.  Load it only once, because loading may take a tenth of a second.
+    # Load a mesh that several limbs share only once, because loading may take a tenth of a second.
     loaded: dict[object, Corrected] = {}
     for shape in described:
         try:
@@ -64,7 +64,7 @@ def load_geometry(robot: Robot, described: list[LinkShape]) -> Geometry:
         turned = _placed(model, kept, solids, turned=True)
         if _gaps(model, turned) < _gaps(model, objects) / 2:
             objects = turned
-            warnings.append("meshes with y up are turned to z up, because only then do the links reach their joints")
+            warnings.append("meshes with y up are turned to z up, because the links reach their joints only then")
     geometry = pin.GeometryModel()
     for solid in objects:
         geometry.addGeometryObject(solid)
@@ -76,7 +76,7 @@ def load_geometry(robot: Robot, described: list[LinkShape]) -> Geometry:
 def _placed(
     model: pin.Model, shapes: list[LinkShape], solids: list[Any], *, turned: bool
 ) -> list[pin.GeometryObject]:
-    """Return the shapes at their joints; ``turned`` rotates meshes whose files state that the y axis is up.
+    """Return the shapes at their joints; if ``turned``, meshes whose files state that the y axis is up are rotated.
 
     Most URDFs expect meshes that are not rotated, because ROS ignores the up axis in COLLADA files.
     """

@@ -21,7 +21,7 @@ from impact_posture.robot.robot import Robot
 from impact_posture.robot.support_polygon import nearest_in_hull
 from impact_posture.system.arrays import Array
 
-# Points less than this (m) behind the foremost point belong to the same flat front.
+# Points behind the foremost point by less than this value (m) belong to the same flat front.
 _FLAT = 5e-4
 # Number of corners of the polygon around a flat front.
 _SIDES = 64
@@ -64,7 +64,7 @@ class Silhouette:
     disk: StoredArray
 
     def foremost(self, direction: Array) -> Array:
-        """Return points that include the foremost points along a unit direction; axes of the joint, shape (k, 3)."""
+        """Return points, including all foremost points along a unit direction, in axes of the joint, shape (k, 3)."""
         points = self.corners + self.ball * direction
         radius = float(np.linalg.norm(self.disk))
         if radius == 0:
@@ -89,7 +89,7 @@ def contact_front(
     *,
     in_world: bool = False,
 ) -> ContactFront | None:
-    """Return the front of the links that do not move relative to a contact frame; ``None`` without shapes.
+    """Return the front of the links that do not move relative to a contact frame; ``None`` if they have no shapes.
 
     These links are the link of the frame, the links welded to it, and the links behind joints that do not move.  The
     function uses the collision shapes of a link, or its visual shapes if it has no collision shapes.

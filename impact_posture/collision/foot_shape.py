@@ -14,14 +14,14 @@ from impact_posture.robot.robot_spec import Support
 from impact_posture.robot.support_polygon import polygon_edges
 from impact_posture.system.arrays import Array
 
-# Points of a foot up to this height (m) above its lowest point also touch the ground.
+# Points of a foot up to this height (m) above its lowest point are treated as touching the ground.
 _PATCH = 5e-4
-# A contact area narrower than this (m) is treated as a point.  The contact area of a ball of 10 cm radius is this
-# wide.
+# A contact area narrower than this value (m) is treated as a point.  The contact area of a ball of 10 cm radius has
+# this width.
 _SOLE = 0.02
 # Cosine of the largest tilt of a sole at the default posture, 10°.
 _UPRIGHT = float(np.cos(np.radians(10.0)))
-# Number of ratios of length and width that are tried for the rectangle in a sole.
+# Number of ratios of length to width that are tried for the rectangle in a sole.
 _PROPORTIONS = 180
 
 
@@ -30,7 +30,7 @@ def support(robot: Robot, frame: str, *, flat: bool) -> Support:
 
     A sole is flat, below its frame, and upright at the default posture.  The size of a sole is the largest rectangle
     around its middle inside the convex hull of its lowest points.  Any other foot touches the ground at its lowest
-    point.  It is a surface if ``flat`` is true, and a point otherwise.
+    point, and is a surface if ``flat`` is true, or else a point.
     """
     foot = Support(frame=frame, kind="surface" if flat else "point")
     sole = _lowest(robot, frame, np.array([0.0, 0.0, 1.0]))
@@ -79,8 +79,8 @@ def _inner_rectangle(points: Array) -> Array:
     if edges is None or edges[1].min() <= 0:
         return np.zeros(2)
     angles = np.pi / 2 * np.arange(1, _PROPORTIONS) / _PROPORTIONS
-    # Also try the proportions of rectangles with a corner at a point, so that the result for a rectangular sole is
-    # exact.
+    # Also try the proportions of rectangles with a corner at one of the points, so that a rectangular sole gives an
+    # exact result.
     proportions = np.hstack([[np.cos(angles), np.sin(angles)], np.abs(points.T) + 1e-9])
     halves = proportions * (edges[1][:, None] / (np.abs(edges[0]) @ proportions)).min(axis=0)
     return np.asarray(halves[:, halves.prod(axis=0).argmax()])

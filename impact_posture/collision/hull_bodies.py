@@ -14,7 +14,7 @@ from impact_posture.collision.shape_corners import shape_points
 from impact_posture.collision.swept_hull import SweptHull, distance_from_hull, hull_corners
 from impact_posture.system.arrays import Array
 
-# Largest distance (m) from a point of a common hull to the nearest shape inside.
+# Largest distance (m) from a point of a common hull to the nearest of the merged shapes.
 _FILL = 0.01
 # Test points on a triangle, as weights of its corners.
 _PLACES = np.array([(i, j, 4 - i - j) for i in range(5) for j in range(5 - i)]) / 4
@@ -34,9 +34,9 @@ class Body(NamedTuple):
 def merged_bodies(shapes: Sequence[pin.GeometryObject], apart: NDArray[np.bool_]) -> list[Body]:
     """Merge shapes of a robot into bodies, so that fewer pairs of bodies must be checked for collisions.
 
-    Two bodies are merged if they have the same joint and must stay apart from the same shapes.  Also, every point of
-    their common hull must be within 1 cm of one of the bodies.  ``apart``, shape (n, n), tells whether two shapes
-    must not touch.
+    Two bodies are merged if they have the same joint and must stay apart from the same shapes.  In addition, every
+    point of their common hull must be within 1 cm of at least one of the bodies.  ``apart``, shape (n, n), tells
+    whether two shapes must not touch.
     """
     corners = [
         hull_corners(shape_points(shape.geometry) @ shape.placement.rotation.T + shape.placement.translation)
@@ -61,7 +61,7 @@ def _fill(a: Body, b: Body) -> bool:
     points, part = np.vstack(parts), np.repeat(np.arange(len(parts)), [len(corners) for corners in parts])
     hull = SweptHull("", "", 0, points, 0.0)
     faces = hull.faces
-    # Check only large faces between different shapes.  All other faces lie in a shape, or are small.
+    # Check only large faces of the hull whose corners belong to different shapes.  All other faces are near a shape.
     edges = np.linalg.norm(points[faces] - points[np.roll(faces, 1, axis=1)], axis=2).max(axis=1)
     open_faces = np.flatnonzero(np.any(part[faces] != part[faces[:, :1]], axis=1) & (edges > _FILL))
     solids = [SweptHull("", "", 0, _thinned(corners), 0.0) for corners in parts]

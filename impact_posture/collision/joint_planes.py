@@ -17,11 +17,11 @@ from impact_posture.system.arrays import Array
 # ``_TRIED`` is the number of grid positions per joint.  ``_MOST_JOINTS`` is the largest number of joints between two
 # bodies.
 _TRIED, _MOST_JOINTS = 25, 3
-# Half of the largest joint range for which planes are searched, rad (m).  The step of the grid is then about half a
-# radian.
+# Half of the largest joint range for which planes are searched, rad (m).  With this range, the step of the grid is
+# about half a radian.
 _MOST_HALF = 6.5
-# ``_MOST_PLANES`` is the largest number of planes for a pair of bodies.  At free positions, the shapes do not touch;
-# at least the fraction ``_LEFT`` of the free positions must remain.
+# ``_MOST_PLANES`` is the largest number of planes for a pair of bodies.  A position is free if the shapes do not
+# touch.  At least the fraction ``_LEFT`` of the free positions must satisfy all planes.
 _MOST_PLANES, _LEFT = 12, 1 / 3
 # The cost of a plane is the number of removed free positions, plus this fraction of all free positions.
 _WORTH = 0.05
@@ -48,7 +48,7 @@ def joint_planes(
 
     The shapes are checked on a grid over the ranges of the joints between the bodies.  Planes remove the grid cells
     around the positions where the shapes touch.  Each step adds the plane with the highest ratio of removed touching
-    positions to removed free positions.  ``touch`` tells whether the shapes touch at given placements.
+    positions to its cost (:data:`_WORTH`).  ``touch`` tells whether the shapes touch at given placements.
     """
     model, start = robot.model, robot.posture()
     lowest, highest = model.lowerPositionLimit, model.upperPositionLimit

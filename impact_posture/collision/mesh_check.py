@@ -16,7 +16,7 @@ from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 
 TOLERANCE = 1e-6
-"""Penetration (m) that does not count as a collision, because solvers let hulls touch within a tolerance."""
+"""Largest penetration (m) that is not treated as a collision, because solvers let hulls touch within a tolerance."""
 
 Standing = tuple[SweptHull, pin.SE3, Collection[int]]
 """An obstacle: its hull, its placement in the world, and the joints whose shapes may touch it."""
@@ -39,7 +39,7 @@ class MeshCheck:
     """Collision check of the shapes of a robot, prepared for many postures.
 
     Overlaps of less than 1 µm are ignored.  Meshes are surfaces, so a mesh entirely inside another does not collide.
-    ``groups`` may contain the group number of each joint.  Shapes of one group may touch, because held joints fix
+    ``groups`` may contain a group number for each joint.  Shapes of the same group may touch, because held joints fix
     them to each other.
     """
 
@@ -101,7 +101,7 @@ class MeshCheck:
 
 
 def _deep(a: Any, at_a: pin.SE3, b: Any, at_b: pin.SE3) -> bool:
-    """Return whether two shapes still collide after a separation by the tolerance."""
+    """Return whether two shapes still collide after they are moved apart by the tolerance."""
     request, result = coal.CollisionRequest(), coal.CollisionResult()
     if not coal.collide(a, transform(at_a), b, transform(at_b), request, result):
         return False

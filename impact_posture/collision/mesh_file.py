@@ -25,10 +25,10 @@ LARGEST_FILE = 100_000_000
 # Longest processor time for reading a mesh: ``_SECONDS``, plus 1 s for each ``_BYTES_PER_SECOND`` bytes.  Reading the
 # largest allowed binary STL takes 16 s.
 _SECONDS, _BYTES_PER_SECOND = 5.0, 2_500_000
-# Least time, s, for reading a mesh after other meshes of the robot took too long.
+# Least time limit, s, for reading a mesh if other meshes of the robot took too long.
 _LEAST_SECONDS = 0.5
-# A mesh may have this many vertices, or one vertex per byte of its file if this is more.  A short file can repeat its
-# parts a million times.
+# Largest number of vertices of a mesh, or one vertex per byte of its file if this is more.  The limit is needed
+# because a short file can repeat its parts a million times.
 _MOST_VERTICES = 200_000
 # Largest number of meshes in memory, which is enough for one robot.
 _MOST_MESHES = 100
@@ -74,7 +74,8 @@ def read_meshes(paths: Iterable[Path]) -> None:
         del _READ[stamp]
 
     def seconds(stamp: _Stamp) -> float:
-        # Each mesh that took too long halves the time of the next mesh, so that many meshes do not take minutes.
+        # Each mesh that took too long halves the time limit of the next mesh, so that many meshes do not take
+        # minutes.
         slow = sum(isinstance(_READ.get(other), CallTimedOut) for other in stamps)
         return max((_SECONDS + stamp[1] / _BYTES_PER_SECOND) * 0.5**slow, _LEAST_SECONDS)
 
@@ -114,8 +115,8 @@ def _parsed(stamp: _Stamp) -> Mesh:
             if sum(entry.file_size for entry in archive.infolist()) > LARGEST_FILE:
                 raise UnusableShape(too_large(path))
     transform, unit = _root_transform(path), _unit(path)
-    # Use a new loader every time, because a loader keeps all meshes in memory.  The loader needs a type of bounding
-    # volumes.  They are not used, and volumes of the type ``BV_AABB`` are built fastest.
+    # Use a new loader every time, because a loader keeps all meshes in memory.  The loader builds bounding volumes,
+    # which are not used, so it gets the type that is built fastest, ``BV_AABB``.
     shape = coal.MeshLoader(coal.BV_AABB).load(str(path), np.ones(3))
     points, triangles = mesh_points(shape), mesh_triangles(shape)
     if len(points) > max(_MOST_VERTICES, stamp[1]):

@@ -1,7 +1,7 @@
 """Shapes of bodies from a compiled MJCF.
 
 MuJoCo has already read and scaled the meshes.  In contacts, MuJoCo and this module replace a mesh by its convex hull.
-Geoms that collide with nothing are visual, and only pictures use them.
+Geoms that never collide are visual geoms, which only pictures use.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def solid_geoms(model: Any) -> Iterator[tuple[int, list[int]]]:
 def disabled_bodies(model: Any) -> set[frozenset[str]]:
     """Return the pairs of bodies that may touch: excluded pairs, and bodies in the same or consecutive rigid groups.
 
-    As in MuJoCo, bodies without joints count as one body with their parents.
+    As in MuJoCo, bodies without joints and their parents form one body.
     """
     names = [object_name(model, "body", b) for b in range(model.nbody)]
     return {frozenset((names[a], names[b])) for a, b in excluded_pairs(model, range(model.nbody))}

@@ -155,7 +155,7 @@ def fit_shapes(robot: Robot, described: list[LinkShape]) -> FittedShapes:
         apart[i, j] = apart[j, i] = False
     merged = merged_bodies(shapes, apart)
     hulls = [_fitted(body, loaded) for body in merged]
-    # All shapes of one body have the same list of shapes that they must not touch.
+    # All shapes of a merged body must stay apart from the same shapes.
     first = [body.shapes[0] for body in merged]
     pairs = pairs_of(apart[np.ix_(first, first)])
     touch = touch_of(shapes)

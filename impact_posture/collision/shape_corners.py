@@ -112,7 +112,7 @@ def surface_of(shape: Any) -> tuple[Array, Triangles]:
 
 
 def ends(points: Array, half_length: float) -> Array:
-    """Return points moved along z to both ends of a shape of this half length, m, shape (2k, 3)."""
+    """Return copies of the points, moved along z by ``half_length`` and by ``−half_length``, m, shape (2k, 3)."""
     return np.vstack([points + np.array([0, 0, side * half_length]) for side in (-1, 1)])
 
 

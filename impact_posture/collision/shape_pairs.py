@@ -29,7 +29,7 @@ Pair = tuple[int, int]
 def pairs_apart(
     model: pin.Model, joints: Sequence[int], links: Sequence[str], disabled: set[frozenset[str]]
 ) -> NDArray[np.bool_]:
-    """Return whether two shapes must not touch, shape (n, n), from the joint and the link of each shape.
+    """Return whether each two shapes must not touch, shape (n, n), from the joint and the link of each shape.
 
     Shapes of the same joint or of consecutive joints may touch.  Links of a pair in ``disabled`` may also touch.
     """
@@ -48,7 +48,7 @@ def pairs_of(apart: NDArray[np.bool_]) -> list[Pair]:
 def touching_by_design(robot: Robot, shapes: Sequence[pin.GeometryObject], pairs: list[Pair]) -> list[Pair]:
     """Return the pairs of shapes that overlap by design, for example the covers of a wrist.
 
-    These shapes touch at the default posture and at more than half of 1,000 random postures.  Parts of a telescope,
+    Such shapes touch at the default posture and at more than half of 1,000 random postures.  Parts of a telescope,
     which slide in each other along one line, only need to touch at a named posture.
     """
     data, touch = robot.model.createData(), touch_of(shapes)

@@ -19,18 +19,18 @@ from impact_posture.system.arrays import Array
 MOST_VERTICES = 40
 """Largest number of vertices of a hull, because every vertex adds a constraint to the optimization."""
 
-# Points are flat if their extent (m) in one direction is smaller than this.  The hull of flat points is twice as
-# thick.
+# Points are treated as flat if their extent in one direction is below this value (m).  Their hull is made twice as
+# thick as this.
 _THIN = 1e-4
 _REQUEST = coal.DistanceRequest(True)
 _REQUEST.gjk_tolerance = 1e-12
 _POINT = coal.Sphere(0.0)
-# The fit adds corners to a hull until no point is farther outside than this (m).
+# The fit adds corners to a hull until no point is outside the hull by more than this value (m).
 _TOLERANCE = 0.004
 # Largest number of candidates for corners; the sweep radius is computed from all points.
 _MOST_CANDIDATES = 4000
 _CHUNK = 20_000
-# The convex hull of fewer points than this takes more time than it saves.
+# For fewer points than this, computing the convex hull takes more time than it saves.
 _FEW = 50
 # Largest error (m) of distances that coal computes.
 _ROUNDING = 1e-9
@@ -67,7 +67,7 @@ class SweptHull:
 
     @cached_property
     def faces(self) -> Array:
-        """Triangles of the hull as indices into ``vertices``, shape (n, 3); a point or a segment has no triangles."""
+        """Triangles of the hull as indices into ``vertices``, shape (n, 3); empty for a point or a segment."""
         if self.known_faces is not None:
             return self.known_faces
         if len(self.vertices) < 4:
@@ -83,7 +83,7 @@ class SweptHull:
             span = self.vertices[1] - self.vertices[0]
             turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), span).matrix()
             return coal.Capsule(self.radius, float(np.linalg.norm(span))), pin.SE3(turn, self.center)
-        # coal searches from neighbor to neighbor, and a vertex without a face has no neighbors.
+        # coal searches a mesh from vertex to neighboring vertex, so each vertex must belong to a face.
         used, faces = np.unique(self.faces, return_inverse=True)
         points, triangles = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
         points.extend(list(self.vertices[used]))
@@ -161,7 +161,8 @@ def _convex_hull(points: Array) -> Any:
     try:
         return ConvexHull(points)
     except QhullError:
-        # The points are flat up to rounding errors.  The option QJ of Qhull joggles the points.
+        # The points are flat up to rounding errors, so the option QJ of Qhull moves the points at random by tiny
+        # amounts.
         return ConvexHull(points, qhull_options="QJ")
 
 

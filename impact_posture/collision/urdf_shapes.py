@@ -24,7 +24,7 @@ from impact_posture.robot.robot import Robot, RobotFiles
 from impact_posture.robot.urdf import parse_urdf
 from impact_posture.system.folder_record import sha256_of
 
-# A shape larger than 5 m and larger than ten times the robot is not in meters.
+# A shape is assumed not to be in meters if its extent exceeds both 5 m and ten times the extent of the robot.
 _LARGEST = 5.0
 _LARGEST_SHARE = 10.0
 # Attributes with the sizes of each shape type, and the number of values in each attribute.
@@ -53,7 +53,7 @@ class LinkShapes(NamedTuple):
     described: list[str]
 
     def add(self, link: str, parts: Sequence[_Part], read: Callable[[_Part, str], LinkShape]) -> None:
-        """Add the shapes of a link; ``read`` returns the shape of a part of the file, with a given name."""
+        """Add the shapes of a link; ``read(part, name)`` reads the shape ``name`` from a part of the file."""
         if parts:
             self.described.append(link)
         for k, part in enumerate(parts):
@@ -86,7 +86,7 @@ class LinkShape:
 
     @property
     def key(self) -> object:
-        """Shapes with the same key have the same coal shape."""
+        """Key in a cache of coal shapes."""
         return self.kind, self.sizes, self.mesh
 
     @property

@@ -41,8 +41,8 @@ class Chart:
     def __init__(self, model: pin.Model) -> None:
         self.slots: list[JointSlot] = []
         # ``copied`` and ``angles`` contain pairs of an index in q and an index in x.  The values of ``copied`` are
-        # equal in q and x.  ``angles`` pairs the cosine of an angle in q with the angle in x; the sine follows the
-        # cosine.
+        # equal in q and x.  For ``angles``, the index in q is the index of the cosine, which the sine follows, and
+        # the index in x is the index of the angle.
         copied: list[tuple[int, int]] = []
         angles: list[tuple[int, int]] = []
         start = 0
@@ -70,7 +70,7 @@ class Chart:
 
     @cached_property
     def bounded(self) -> tuple[list[int], list[int]]:
-        """Indices, in ``v`` and in ``x``, of the coordinates that can have limits; for these, ``v = dx/dt``."""
+        """Indices, in ``v`` and in ``x``, of the coordinates that can have limits and for which ``v = dx/dt``."""
         slots = [slot for slot in self.slots if slot.kind.family in BOUNDED]
         in_v = [k for slot in slots for k in range(slot.v.start, slot.v.stop)]
         return in_v, [k for slot in slots for k in range(slot.x.start, slot.x.stop)]

@@ -13,8 +13,8 @@ from impact_posture.dynamics.spatial import Spin, constant, quaternion_matrix, s
 from impact_posture.errors import UnsupportedJoint
 from impact_posture.robot.model_joints import JOINT_ENTRIES, joint_family
 
-# ``_TURNING`` are families that rotate by an angle about an axis.  The configuration of a ``_QUATERNION`` family ends
-# with a quaternion.
+# ``_TURNING`` are families that rotate by an angle about an axis.  The configuration of the ``_QUATERNION`` families
+# ends with a quaternion.
 _TURNING, _QUATERNION = ("revolute", "continuous", "planar"), ("free-flyer", "spherical")
 
 

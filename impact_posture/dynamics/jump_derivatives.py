@@ -102,7 +102,7 @@ class JumpDerivatives:
     def _lies_on(self, ends: Sequence[int], joints: Sequence[int], *, itself: bool = True) -> Array:
         """Return whether each joint (column) is on the path from the root to each end joint (row).
 
-        ``itself`` decides whether an end joint is on its own path.
+        If ``itself`` is false, an end joint is not on its own path.
         """
         paths = {end: {int(i) for i in self._tree.model.supports[end]} - (set() if itself else {end}) for end in ends}
         lies = [joint in paths[end] for end in ends for joint in joints]
@@ -122,7 +122,7 @@ class JumpDerivatives:
         return below + above.T
 
     def _at_feet(self, motions: ca.SX, joints: Sequence[int]) -> ca.SX:
-        """Return foot velocities.  In column k, the links after ``joints[k]`` move with ``motions[:, k]``."""
+        """Return foot velocities; column k is for a motion ``motions[:, k]`` of all links after ``joints[k]``."""
         rows = [ca.SX(0, len(joints))]
         for foot, X in zip(self._feet, self._foot_motions, strict=True):
             rows.append(_kept(X @ motions, np.tile(self._lies_on([foot.point.joint], joints), (foot.rows, 1))))

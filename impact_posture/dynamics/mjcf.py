@@ -1,7 +1,7 @@
 """Build a MuJoCo model from a ``pin.Model``, with the same bodies, joints, inertias and armature.
 
 The URDF reader of MuJoCo is not used, because it loses package paths, the floating base and the armature, and changes
-the order of joints.  The model has no geometry.  A simulation adds shapes with :meth:`Mjcf.add_geom` and
+the order of joints.  The model has no shapes.  A simulation adds shapes with :meth:`Mjcf.add_geom` and
 :meth:`Mjcf.add_plane`.
 """
 
@@ -57,7 +57,8 @@ class Mjcf:
         moments: Body name → principal moments of inertia that MuJoCo rejects, kg·m², shape (3,).  The spec contains
             the nearest accepted moments, and :meth:`compile` sets the exact moments.
         inverse_weights: Body name → ``body_invweight0`` that :meth:`compile` sets, shape (2,): 1/kg and 1/(kg m²).
-            MuJoCo scales the softness of contacts with it.  ``None`` stands for the values of the parent body.
+            MuJoCo scales the softness of contacts with ``body_invweight0``.  ``None`` stands for the values of the
+            parent body.
     """
 
     spec: Any
@@ -94,7 +95,7 @@ class Mjcf:
         )
 
     def couple_joints(self, robot: Robot) -> None:
-        """Couple followers to their leaders, as stiffly as MuJoCo can with the present time step."""
+        """Couple followers to their leaders, as stiffly as the time step of the model allows."""
         types = import_mujoco()
         joint, kind = types.mjtObj.mjOBJ_JOINT, types.mjtEq.mjEQ_JOINT
         for c in robot.couplings:

@@ -34,7 +34,7 @@ class MjcfSlot:
         qvel: Entries of the joint in ``qvel``.
         placement: Placement of the rest frame of the joint in its parent.
         moved: Whether the joint is a MuJoCo free joint whose rest frame is not the world frame.  In MuJoCo, pose and
-            linear velocity of a free joint are in the world.  Positions of slides are in the rest frame.
+            linear velocity of a free joint are in world axes, and positions of slides in the rest frame.
     """
 
     joint: JointSlot
@@ -71,8 +71,8 @@ class MjcfLayout:
             self.slots.append(MjcfSlot(joint, *ends, place, moved))
             places += x
             rates += v
-        # For speed, a permutation converts all joints at once.  Only poses relative to another frame and linear
-        # velocities are converted joint by joint.
+        # For speed, a permutation converts most entries of all joints at once.  Only poses relative to another frame
+        # and linear velocities are converted for each joint.
         self._places, self._permutation = np.array(places, dtype=int), np.eye(self.nv)[rates]
         self._rates = np.argsort(rates)
         self._moved = [slot for slot in self.slots if slot.moved]
@@ -82,8 +82,8 @@ class MjcfLayout:
     def places(self) -> tuple[NDArray[np.int_], NDArray[np.int_]] | None:
         """Index in ``qpos`` of each entry of ``q``, and index in ``qvel`` of each entry of ``v``.
 
-        For a floating base, the caller must also normalize the quaternion and rotate the linear velocity.  The value
-        is ``None`` for a model with joints that are not hinges or slides.
+        ``None`` for a model with joints that are not hinges or slides.  For a floating base, the caller must also
+        normalize the quaternion and rotate the linear velocity.
         """
         base = len(self._turning)
         # If no joint has a cosine and a sine in q, the chart coordinates equal q.

@@ -18,7 +18,7 @@ from impact_posture.system.arrays import Array
 
 
 class ModelParameters(RepeatedLimbs):
-    """Parameters for the nonzero armatures and joint positions of a model, without repeated limbs.
+    """Parameters for the nonzero armatures and joint positions of a model, in which no limbs are treated as repeated.
 
     Attributes:
         symbol: CasADi symbol that stacks all parameters, shape (n, 1), with n ≥ 1.
@@ -46,7 +46,7 @@ class ModelParameters(RepeatedLimbs):
 
 
 def without_parameters(robot: Robot) -> Robot:
-    """Return the robot with all nonzero parameters set to one.  Robots with equal results share code."""
+    """Return a copy of the robot with all nonzero parameters set to one; robots with equal copies can share code."""
     model, armature = robot.model.copy(), np.array(robot.model.armature)
     finite = np.isfinite(armature)
     armature[finite] = rounded(armature[finite]) != 0.0

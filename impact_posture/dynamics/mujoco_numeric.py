@@ -24,8 +24,8 @@ class MujocoNumeric:
     The model is the MJCF from which the robot was loaded.  The result of :func:`build_mjcf` replaces this model if
     the robot comes from a URDF, its settings contain a ``mounting``, or a frame in ``frames`` belongs to a joint.
 
-    The method :meth:`at` sets the configuration and must be called first.  All vectors and matrices are in the order
-    and tangent space of Pinocchio.  Joints with an infinite armature get an armature of zero.
+    The method :meth:`at`, which must be called first, sets the configuration.  All vectors and matrices are in the
+    order and tangent space of Pinocchio.  Joints with an infinite armature get an armature of zero.
 
     Raises:
         InputError: MuJoCo is not installed.
@@ -49,7 +49,7 @@ class MujocoNumeric:
             moving = [joints.getJointId(name) for name in model.names[1:]]
             self._bodies = {object_name(self.model, "body", b): b for b in range(self.model.nbody)}
         self._sites = {object_name(self.model, "site", s): s for s in range(self.model.nsite)}
-        # Entries of the joints that the robot does not lock.
+        # Entries, in q and ν, of the joints that the robot does not lock.
         self._q, self._v = (np.r_[tuple(part(joints, i) for i in moving)] for part in (q_slice, v_slice))
         if self._bodies:
             armature = np.zeros(joints.nv)

@@ -13,7 +13,7 @@ from impact_posture.system.arrays import Array
 class Numeric:
     """Compute kinematics, mass matrix and their tangent derivatives at one configuration.
 
-    The method :meth:`at` sets the configuration and must be called first.
+    The method :meth:`at`, which must be called first, sets the configuration.
 
     Attributes:
         locked: True for the velocity entries of joints that an infinite armature locks, shape (nv,).
@@ -58,15 +58,15 @@ class Numeric:
         """Return the tangent gradient of ``leftᵀ M(q) right``, shape (nv,), from the derivatives of RNEA."""
         dtau_dq = pin.computeRNEADerivatives(self.model, self.data, self.q, self._zero, right)[0]
         gradient = np.asarray(dtau_dq).reshape(self.model.nv, -1).T @ left
-        self.at(self.q)  # restore the data, because computeRNEADerivatives changes them
+        self.at(self.q)  # computeRNEADerivatives changed the data
         return np.asarray(gradient)
 
     def coupling_gradient(self, point: PointOnLink, wrench: Array, v: Array, *, in_frame: bool = False) -> Array:
         """Return the tangent gradient of ``wᵀ J(q) v``, shape (nv,).
 
-        With ``in_frame``, ``w`` is constant in the frame of the point; otherwise, in the world.  The
+        If ``in_frame``, ``w`` is constant in the frame of the point; otherwise, ``w`` is constant in the world.  The
         LOCAL_WORLD_ALIGNED derivatives of Pinocchio omit the rotation of the frame.  Therefore the LOCAL derivatives
-        are used and rotated to world axes.
+        are computed and rotated to world axes.
         """
         pin.computeForwardKinematicsDerivatives(self.model, self.data, self.q, v, self._zero)
         frame = self.model, self.data, point.joint, point.placement, pin.LOCAL

@@ -62,7 +62,7 @@ class RepeatedLimbs:
         self.parameters: dict[tuple[int, int, str], tuple[ca.SX, float]] = {}
 
     def counterparts(self, joint: int) -> list[int]:
-        """Return the joints at the same position in all limbs of the group, or only ``joint`` outside of limbs."""
+        """Return the joints at the same position in all limbs of the group; only ``joint`` if it is in no limb."""
         place = self.places.get(joint)
         return [joint] if place is None else [limb[place.position] for limb in self.groups[place.group]]
 
@@ -130,7 +130,7 @@ def _limb(model: pin.Model, root: int) -> tuple[int, ...]:
 
 
 def _alike(model: pin.Model, first: tuple[int, ...], second: tuple[int, ...]) -> bool:
-    """Return whether two limbs have the same joint types, and nearly the same zeros in placements and inertias."""
+    """Return whether two limbs have equal joint types, and nearly the same zeros in placements and inertias."""
     if _joints(model, first) != _joints(model, second):
         return False
     pairs = [[_numbers(model, k) != 0.0 for k in pair] for pair in zip(first, second, strict=True)]

@@ -52,7 +52,7 @@ def rounded(value: ArrayLike) -> NDArray[np.float64]:
 
 
 def constant(value: ArrayLike) -> ca.SX:
-    """Turn numbers into ``SX`` after :func:`rounded`; exact zeros become structural zeros."""
+    """Convert rounded numbers (:func:`rounded`) to ``SX``; zeros become structural zeros."""
     return ca.sparsify(ca.SX(rounded(value)))
 
 

@@ -35,7 +35,7 @@ from impact_posture.dynamics.spatial import (
 __all__ = ["ByJoint", "PointOnLink", "Response", "Tree", "Wrench"]
 
 _ZERO = ca.SX(6, 1)
-# Entry of a follower in ν, entry of its leader, and ratio.
+# Coupling of two joints: entry of the follower in ν, entry of its leader, and ratio of their velocities.
 Coupled = tuple[int, int, float]
 
 
@@ -337,7 +337,7 @@ class Tree(Kinematics):
         """Add ``f × u + m × ω`` to ``turning`` for a wrench ``(f, m)`` that is constant in the world.
 
         ``(u, ω)`` is the velocity of the point of the wrench.  When a joint j on the path to the link turns, the
-        wrench rotates relative to the link.  This contributes ``−ω_jᵀ (f × u + m × ω)`` to the gradient.
+        wrench rotates relative to the link.  The rotation contributes ``−ω_jᵀ (f × u + m × ω)`` to the gradient.
         """
         joint = wrench.point.joint
         if wrench.in_frame:

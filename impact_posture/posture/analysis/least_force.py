@@ -58,4 +58,4 @@ def explain_force_bound(
         hint = "permit more with `max_force`, lower the `speed`, or relax another constraint"
         error.reword(f"{bound:g} N cannot be kept: {reached}", "max_force", hint)
     else:
-        error.reword(f"no start keeps {bound:g} N, although {reached}", "max_force", "start from another `posture`")
+        error.reword(f"no start obeys {bound:g} N, although {reached}", "max_force", "start from another `posture`")

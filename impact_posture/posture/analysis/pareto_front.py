@@ -46,11 +46,11 @@ _STILL = 1e-6
 _EQUAL = 1e-9
 # If the objective increases along the curve by more than this fraction of the initial objective, a note is added.
 _RISE = 1e-6
-# Maximum number of optima, besides the best optimum, from which a path starts.
+# Maximum number of optima, besides the best optimum, from which solves for decreasing bounds start.
 _PATHS = 3
 # Maximum number of rounds in which solves start from results for neighboring bounds.
 _ROUNDS = 3
-# Maximum number of times that missing rows are added to the program for one point.
+# Maximum number of times that missing rows are added to the program for one bound.
 _GROWTH = 8
 # Number of starts of the search for the posture with the least force.
 _FORCE_STARTS = 8
@@ -115,7 +115,7 @@ def _bounded(problem: ConstrainedProblem, price: TradeOffPrice) -> ConstrainedPr
 
 @dataclass(frozen=True, eq=False)
 class _End:
-    """The result of a solve, and the name of the path to which the solve belongs."""
+    """The result of a solve; ``path`` is the order of bounds, ``outward`` (increasing) or ``inward``."""
 
     path: str
     point: TradePoint
@@ -221,7 +221,7 @@ class _Curve:
         return replace(self._problem, constraints=(*self._problem.constraints[:-1], bound))
 
     def _take(self, k: int, path: str, q: Array, certificate: Certificate | None = None) -> None:
-        """Keep the posture ``q`` if it satisfies the constraints and is the best within bound ``k``."""
+        """Keep the posture ``q`` if it satisfies the constraints and is the best so far under bound ``k``."""
         end, best = _End(path, self._point(k, q, certificate)), self._best[k]
         uncertified, objective = end.rank
         if end.point.certificate.feasible and (

@@ -13,9 +13,10 @@ from impact_posture.robot.model_joints import rigid_groups
 from impact_posture.robot.support_polygon import nearest_in_hull, polygon_edges
 from impact_posture.system.arrays import Array
 
-# A center of mass at most this far (m) outside the feet is not reported.
+# A center of mass outside the feet by at most this value (m) is not reported.
 _OUTSIDE = 0.01
-# Origins of joints or links farther than this (m) behind a surface or below the ground are reported.
+# Origins of joints or links are reported if they are farther than this value (m) behind a surface or below the
+# ground.
 _BEHIND = 0.01
 
 
@@ -68,7 +69,7 @@ def _surface_warnings(prepared: Prepared, initial: Array, q: Array, posture: str
     lines = []
     if before:
         lines.append(
-            f"the initial posture has {listed(before, 3)} behind the surface: the normal points out of it, "
+            f"the initial posture has {listed(before, 3)} behind the surface: the normal must point out of it, "
             "towards the robot; check its sign"
         )
     new = [name for name in after if name not in before]
@@ -109,10 +110,10 @@ def _ground_warnings(prepared: Prepared, q: Array, posture: str) -> list[str]:
 
 
 def _origins(prepared: Prepared, numeric: Numeric) -> list[tuple[int, str, Array]]:
-    """Return joint index, name and world origin of the links or joints that no collision constraint keeps apart.
+    """Return joint index, name and world origin of the links whose distances no collision constraint checks.
 
-    The result contains the links without shapes.  If no link has a shape, or if collisions are not constrained,
-    the result contains all joints.
+    These are the links without shapes.  If no link has a shape, or if there are no collision constraints, all joints
+    are returned instead.
     """
     robot, around = prepared.impact.robot, prepared.problem.surroundings
     if around is not None and around.shapes.bodies:

@@ -61,7 +61,7 @@ def changes(
 ) -> tuple[Change, ...]:
     """Return the changes from the impact ``before`` to the impact ``after``; ``speed`` is the approach speed, m/s.
 
-    ``force`` is the relative change of the peak force of a linear contact; it is used if the peak forces are unknown.
+    ``force`` is the relative change of the peak force of a linear contact, for use if the peak forces are unknown.
     ``where`` names the contact if there are several.
     """
     return (*_velocities(before, after, FELT * speed), *_contact(before, after, force, where))

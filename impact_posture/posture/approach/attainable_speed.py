@@ -117,10 +117,11 @@ class AttainableSpeed:
             infinite at some postures.
         free: Indices of the free velocities, the entries of ``ν`` that may be nonzero, shape (k,).
         scale: Unit of each free velocity, rad/s or m/s, shape (k,).
-        moves: Matrix from the free velocities in this unit to ``ν``, including coupled joints, shape (nv, k).
-        upper: Limit of each free velocity in this unit, shape (k,); infinite if the URDF has no limit.
+        moves: Matrix that maps the free velocities, divided by ``scale``, to ``ν``, including coupled joints, shape
+            (nv, k).
+        upper: Limit of each free velocity, divided by ``scale``, shape (k,); infinite if the URDF has no limit.
         roomy: Indices, in ``free``, of the joints that need room for a run-up, shape (r,).
-        lowest, highest: Position limits of these joints with the margin, rad or m, shape (r,).
+        lowest, highest: Position limits of the joints ``roomy``, reduced by the margin, rad or m, shape (r,).
     """
 
     def __init__(self, robot: Robot, objective: Objective, requirements: Requirements) -> None:

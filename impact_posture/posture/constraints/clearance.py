@@ -109,10 +109,10 @@ class Clearance(Constraint):
         return closest
 
     def grown(self, model: Numeric, auxiliaries: Array | None = None) -> Self:
-        """Return the constraint with rows for violated pairs, or for further corners of pairs, in the program.
+        """Return the constraint with additional rows in the program for violated pairs.
 
-        A pair whose slack exceeds half of its violation gets no rows for further corners, because the solver violated
-        even the present rows.
+        The rows are for a new pair, or for further corners of a pair.  If the slack of a pair exceeds half of its
+        violation, the pair gets no further rows, because the solver violated even the present rows.
         """
         values, active = self.value(model), dict(self.active)
         unknowns = {} if auxiliaries is None else self._unknowns(auxiliaries)

@@ -35,7 +35,7 @@ class LinearJoints(ExpressionConstraint):
     def apart(robot: Robot, planes: JointPlanes) -> LinearJoints:
         """Keep two links apart.  Violations are relative to half the range of a joint."""
         name, bounds = " / ".join(planes.bodies), (np.full(planes.bounds.size, -np.inf), planes.bounds)
-        text = f"{name} apart by the joints {', '.join(planes.joints)}"
+        text = f"{name} kept apart by the joints {', '.join(planes.joints)}"
         constraint = LinearJoints(robot, planes.joints, planes.normals, bounds, name, text)
         constraint.unit = "of half the joint range"
         return constraint

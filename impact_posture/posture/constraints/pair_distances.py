@@ -125,7 +125,8 @@ class PairDistances:
         low = (self._corners[first] @ (self._axes[first].transpose(0, 2, 1) @ along)).min(axis=1)
         high = (self._corners[second] @ (self._axes[second].transpose(0, 2, 1) @ along)).max(axis=1)
         gaps = (apart[:, None] @ along)[:, 0] + low - high
-        # A pair without an exact distance so far has the normal zero, and the gap along this normal is not used.
+        # The normal of a pair is zero until its exact distance is computed.  Then only the gap along the centers is
+        # used.
         best = np.where(self._normals[pairs].any(axis=1), gaps.max(axis=1), gaps[:, 0])
         return np.asarray(best - self._gaps[pairs] - self._offsets[second])
 

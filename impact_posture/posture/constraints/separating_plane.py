@@ -44,10 +44,11 @@ _UNIT = 0.02
 # is the tangent of the tilt angle.
 _TILT = 0.5
 _AROUND = np.array([[0.0, 0.0], *[[np.cos(a), np.sin(a)] for a in np.arange(8) * np.pi / 4]])
-# A plane separates two bodies if it cuts less than this (m) into a body. The certificate accepts twice this value.
+# A plane separates two bodies if it cuts less than this value (m) into a body.  The certificate accepts twice this
+# value.
 _KEPT = 5e-9
-# If a corner is farther than this, m, from the plane, its row is inactive and therefore left out of the
-# linearization.
+# If the distance of a corner from the plane exceeds this value, m, its row is inactive, and the linearization omits
+# it.
 _NEAR = 1e-3
 
 

@@ -29,14 +29,15 @@ from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_spec import Support
 from impact_posture.system.arrays import Array
 
-# A contact point closer to a plane than this, m, is treated as lying in the plane.
+# A contact point is treated as lying in a plane if their distance is below this value, m.
 _BESIDE = 0.03
 # Two contacts can be at the same surface only if the cosine of the angle between their normals exceeds this value.
 _PARALLEL = 0.999
 # Number of tilted surfaces that replace a cone of surfaces.  In directions between the tilted surfaces, the clearance
 # is up to 15 % larger.
 _TILTED = 6
-# If a fixed body lies farther than this, m, behind the plane of the surface, the surface must end before this body.
+# If a fixed body lies behind the plane of the surface by more than this value, m, the surface must end before the
+# body.
 _BEHIND = 1e-3
 
 
@@ -228,7 +229,7 @@ class Surroundings:
 
     @property
     def by_design(self) -> str:
-        """Hint for a pair of links that may touch."""
+        """Hint that says how the user can permit links to touch."""
         tag = "<disable_collisions> in an SRDF" if self.robot.mjcf is None else "<exclude> in the MJCF"
         return f"links that touch by design may touch by {tag}"
 
@@ -307,7 +308,6 @@ class Surroundings:
         return np.asarray(self._numeric.placement(point_on(self.robot, contact.frame, contact.offset)).rotation @ n)
 
     def _above(self, point: PointOnLink, plane: ConvexBody) -> float:
-        """Return the height of a point above a plane, m."""
         hull = SweptHull("", "", point.joint, np.array([point.position]), 0.0)
         return self._height(ConvexBody.of_link(hull), plane)
 

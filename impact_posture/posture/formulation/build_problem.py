@@ -40,7 +40,7 @@ from impact_posture.robot.robot_spec import Support
 from impact_posture.robot.support_polygon import polygon_edges
 from impact_posture.system.arrays import Array
 
-# The bounds of a follower in the program are wider than the limits of this joint by this value, rad or m.
+# The bounds of a follower in the program are wider than its joint limits by this value, rad or m.
 _WIDER = 0.01
 
 
@@ -118,8 +118,8 @@ def retarget(
     """Return the problem with another target of its only contact frame; the program stays the same.
 
     The target is a position in world axes, m, and a quaternion x y z w.  If ``position`` or ``quaternion`` is
-    ``None``, the initial position or orientation is the target.  A model ``numeric`` that the caller passes is set to
-    the given posture.
+    ``None``, the initial position or orientation is the target.  If ``numeric`` is given, the function sets it to the
+    given posture.
 
     Raises:
         InputError: The contact pose is free and cannot have a target, or the quaternion does not have unit length.
@@ -140,7 +140,7 @@ def _surroundings(
 ) -> Surroundings:
     """Return the bodies that the links must not touch.
 
-    A contact whose pose is free has no surface, because there an object hits the robot.
+    A contact with a free pose has no surface, because an object hits the robot there.
     """
     around = Surroundings(objective.robot, numeric, requirements.hold, requirements.clearance)
     touching = [contact for contact, mode in struck if mode != "free"]

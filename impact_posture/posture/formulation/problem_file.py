@@ -51,7 +51,7 @@ class Prepared:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Warnings that are known before the search: about the robot, the objective, and the collision shapes."""
+        """Warnings about the robot, the objective and the collision shapes, which are known before the search."""
         around = self.problem.surroundings
         return tuple(dict.fromkeys((*self.impact.warnings, *(around.shapes.warnings if around else ()))))
 
@@ -69,7 +69,7 @@ def read_settings(path: Path, over: dict[str, object] | None = None) -> ProblemS
 
 
 def prepare(settings: ProblemSettings, impact: ResolvedImpact | None = None) -> Prepared:
-    """Resolve all defaults and build the problem without solving it; ``None`` resolves the impact from ``settings``.
+    """Resolve all defaults and build the problem without solving it; by default, ``settings`` define the impact.
 
     Raises:
         ImpactPostureError: A setting is wrong; the error describes the first wrong setting in one line.

@@ -26,7 +26,7 @@ from impact_posture.system.arrays import Array, independent_rows, null_space
 
 # Angle of a trial turn, rad.
 _TRIAL = 0.05
-# The constraints allow a trial turn if at least this fraction of its angle remains after the projection onto the
+# The constraints allow a trial turn if at least this fraction of the angle remains after the projection onto the
 # constraints.
 _SURVIVES = 0.1
 # Number of random feasible postures at which ranks are compared.
@@ -94,7 +94,7 @@ def make_well_posed(problem: ConstrainedProblem) -> ConstrainedProblem:
     Four point feet on planar legs (solo8) give 12 equations of rank 10, so two equations are redundant.  To first
     order, the base can roll, although any finite roll would spread the feet.  Both the redundant equations and this
     roll prevent the solver from converging.  So the program omits the redundant rows, which the certificate still
-    checks, and a constraint blocks the turn.
+    checks, and a constraint blocks the roll.
     """
     numeric = Numeric(problem.robot.model)
     jacobian = equality_jacobian(problem, numeric.at(problem.given))

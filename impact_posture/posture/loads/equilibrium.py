@@ -27,7 +27,7 @@ class Distribution:
 
     Attributes:
         forces: Vector ``z`` of the forces of rotors and feet, in units of the robot's weight, shape (k,).
-        shares: Signed share of its range that each actuator uses (:class:`Equilibrium`), shape (actuators,).
+        shares: Share of each actuator, −1 to 1 between its limits (:class:`Equilibrium`), shape (actuators,).
         unbalanced: Sum of the absolute entries of the unbalanced wrench on the base; zero if the base is balanced.
             Forces are in units of the robot's weight, moments in units of the weight times 1 m.
         jacobian: Tangent Jacobian of ``unbalanced`` and the absolute shares, shape (1 + actuators, nv).  If ``z`` has

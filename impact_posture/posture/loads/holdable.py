@@ -157,7 +157,7 @@ class ReachableWrench(ExpressionConstraint):
     unit = "of the weight"
 
     def __init__(self, name: str, load: StaticLoad, rows: Array) -> None:
-        self.name, self._load = f"force on the base beyond the rotors {name}", load
+        self.name, self._load = f"force on the base that the rotors cannot exert {name}", load
         self._rows = np.hstack([rows, np.zeros((len(rows), load.model.nv - 6))])
         self.parameters = np.zeros(0)
         self.lower = self.upper = np.zeros(len(rows))

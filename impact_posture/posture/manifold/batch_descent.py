@@ -3,9 +3,9 @@
 Each step is the sum of a quasi-Newton step (BFGS) in the tangent space of the equalities and of a Gauss–Newton step
 that returns to the equalities.  Postures that violate the equalities are compared by the Lagrangian ``m − λᵀc``, with
 the merit m, the equalities c and the least-squares multipliers λ.  To first order, the Lagrangian is the merit after
-the return to the equalities, so a step needs a single evaluation.  The batch stays full, because a new descent can
-begin when another ends.  For an arm, a descent takes about 0.3 ms, and a run of IPOPT about 10 ms.  Clearances and
-loads have no batch function, so descents ignore them.
+the return to the equalities, so a step needs a single evaluation.  When a descent ends, a new descent can begin, so
+the batch stays full.  For an arm, a descent takes about 0.3 ms, and a run of IPOPT about 10 ms.  Clearances and loads
+have no batch function, so descents ignore them.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ class BatchDescent:
         return len(self._state.x)
 
     def add(self, x: Array, tag: NDArray[np.int_]) -> None:
-        """Project postures, shape (N, nx), and begin a descent from each that reaches the equalities."""
+        """Project postures, shape (N, nx), and begin a descent from each posture that reaches the equalities."""
         projected = self.manifold.project(x, _PROJECTING, within=True, tolerance=_NEAR)
         begun = self._begin(projected.x[projected.converged], tag[projected.converged])
         begun = begun.taken(np.isfinite(begun.merit))
@@ -176,8 +176,8 @@ class BatchDescent:
         for _ in range(_ACTIVE_SETS):
             jacobian[rows] = np.where(free[rows, None, :], at.jacobian[rows], 0.0)
             inverse[rows] = right_inverse(jacobian[rows])
-            # The gradient minus the part that the equalities balance.  At a limit, the sign of this difference shows
-            # whether the limit is active.
+            # Gradient minus its component that multipliers of the equalities balance.  At a limit, the sign of this
+            # difference shows whether the limit is active.
             multipliers[rows] = times(inverse[rows].transpose(0, 2, 1), at.gradient[rows])
             rest[rows] = at.gradient[rows] - times(at.jacobian[rows].transpose(0, 2, 1), multipliers[rows])
             before, free = free, ~self.manifold.blocked(x, -rest)

@@ -89,7 +89,7 @@ _OPERATION = """            case {}: {{
 
 @cache
 def _compiled_loop() -> Callable[..., None] | None:
-    """Return the loop in C, which is built once and cached; ``None`` if it cannot be built."""
+    """Return the loop in C, which is built once and cached; ``None`` if the build fails."""
     cases = (_OPERATION.format(code, expression) for code, (_, expression) in _OPERATIONS.items())
     source = _LOOP.replace("OPERATIONS", "\n".join(cases))
     numbers = {"LANES": _LANES, "CONSTANT": ca.OP_CONST, "INPUT": ca.OP_INPUT, "OUTPUT": ca.OP_OUTPUT}
@@ -206,7 +206,6 @@ class BatchFunction:
 
     @cached_property
     def _loop_program(self) -> _LoopProgram:
-        """The operations for the loop in C."""
         function, operations = self._function, self._operations
         assert operations is not None  # noqa: S101 (narrows a type)
         before = np.cumsum([0, *(function.nnz_in(k) for k in range(function.n_in()))]).tolist()
@@ -229,7 +228,6 @@ class BatchFunction:
 
     @cached_property
     def _program(self) -> _Program:
-        """The operations with arrays for ``_WIDTH`` postures."""
         function, operations = self._function, self._operations
         assert operations is not None  # noqa: S101 (narrows a type)
         inputs = [np.zeros((function.nnz_in(k), _WIDTH)) for k in range(function.n_in())]

@@ -1,7 +1,7 @@
 """The constraint manifold of a posture problem, evaluated at many postures at once.
 
 The functions of the program evaluate one posture at a time.  Here, a batch of postures is evaluated, and NumPy solves
-the small linear systems of the batch together.  A posture of talos takes about 0.1 ms.
+the small linear systems of the batch together.  This takes about 0.1 ms for each posture of talos.
 """
 
 from __future__ import annotations
@@ -209,7 +209,7 @@ class ConstraintManifold:
         return np.asarray(step * np.minimum(1.0, _LONGEST_STEP / np.maximum(size, 1e-300)))
 
     def blocked(self, x: Array, direction: Array) -> NDArray[np.bool_]:
-        """Return a mask, shape (N, nv), of the joints at a limit that the direction would violate."""
+        """Return a mask, shape (N, nv), of the joints that ``direction`` would move beyond a limit."""
         in_v, in_x = (np.array(places, dtype=int) for places in self.chart.bounded)
         at, along = x[:, in_x], direction[:, in_v]
         blocked = np.zeros(direction.shape, dtype=bool)

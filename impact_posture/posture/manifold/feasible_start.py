@@ -60,7 +60,7 @@ class Projector:
         return np.minimum(np.maximum(self.chart.to_x(q), self.problem.lower), self.problem.upper)
 
     def residual(self, q: Array) -> tuple[Array, Array]:
-        """Return the violations of all rows at ``q`` and their Jacobian; both are zero for satisfied inequalities."""
+        """Return violations and Jacobian of all rows at ``q``; both are zero for a satisfied inequality."""
         self.numeric.at(q)
         values, jacobians = [np.zeros(0)], [np.zeros((0, self.problem.robot.nv))]
         for constraint, equality in self._projected:
@@ -75,7 +75,7 @@ class Projector:
     def outside(self, q: Array, most: float = np.inf) -> float:
         """Return the sum of the violations of all constraints that are not projected.
 
-        If the sum of the violations exceeds ``most``, the result may be too low.
+        If the sum exceeds ``most``, the result may be any value above ``most``.
         """
         self.numeric.at(q)
         total = 0.0
@@ -104,8 +104,8 @@ class Projector:
                 gram = free @ free.T
                 diagonal = gram.reshape(-1)[:: len(gram) + 1]
                 plain = diagonal.copy()
-                # Two frames on one link can give the same row twice.  The matrix is then singular, so the damping
-                # must exceed rounding errors.
+                # If two frames are on one link, a row can occur twice, and the matrix is singular.  The damping must
+                # therefore exceed rounding errors.
                 least = ROUNDING * max(1.0, float(plain.sum()))
             diagonal[:] = plain + (damping * min(1.0, size) + least)
             step = -free.T @ np.linalg.solve(gram, value)
@@ -123,7 +123,7 @@ class Projector:
         return Projection(q, float(np.abs(value).max(initial=0.0)))
 
     def _blocked(self, x: Array, direction: Array) -> NDArray[np.bool_]:
-        """Return a mask, shape (nv,), of the tangent entries at a limit that the descent direction would violate."""
+        """Return a mask, shape (nv,), of the joints that ``direction`` would move beyond a limit."""
         at, along = x[self._in_x], direction[self._in_v]
         at_low = (at <= self._low + 1e-12) & (along < 0)
         at_high = (at >= self._high - 1e-12) & (along > 0)
@@ -186,7 +186,7 @@ class StartDraw:
 def random_posture(
     problem: ConstrainedProblem, chart: Chart, rng: np.random.Generator, near: Array | None = None
 ) -> Array:
-    """Return a random posture near ``near``, or anywhere within the limits; it may violate the constraints."""
+    """Return a random posture near ``near``, or anywhere within the limits; constraints are ignored."""
     model = problem.robot.model
     base = problem.robot.first_joint
     if near is not None:

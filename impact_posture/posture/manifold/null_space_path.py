@@ -17,8 +17,8 @@ from impact_posture.system.arrays import Array
 class NullSpacePath:
     """Postures ``q`` of a path along the constraints, shape (N, nq), and the impact quantities at each posture.
 
-    ``s`` is the path length in the tangent norm, shape (N,).  The objective, H, G, V and S have the same shape.  S is
-    NaN at postures where it is undefined.
+    ``s`` is the path length in the tangent norm, shape (N,).  The arrays of the objective, H, G, V and S have the
+    shape (N,).  Undefined values of S are NaN.
     """
 
     q: Array

@@ -107,7 +107,7 @@ def bound_objective(motion: SelfMotion, best: float, gap: float = 0.01) -> Optim
 
 
 def _retire(active: _Patches, retired: float, threshold: float) -> tuple[float, _Patches]:
-    """Retire patches whose bound exceeds ``threshold``; return the least bound of retired patches, and the rest."""
+    """Retire patches whose bound exceeds ``threshold``; return their least bound, and the remaining patches."""
     below = active.lower < np.log(threshold)
     return min(retired, float(active.lower[~below].min(initial=np.inf))), active.where(below)
 

@@ -19,7 +19,7 @@ from impact_posture.system.arrays import Array
 
 # First and longest step along a curve, rad or m.
 _FIRST, LONGEST_STEP = 0.02, 0.08
-# A curve is treated as singular if a shorter step than this would be needed, rad or m.
+# A curve is treated as singular if it needs a step shorter than this value, rad or m.
 _SINGULAR = 1e-7
 # Least cosine of the angle by which the tangent of a curve turns in one step.
 _TURN = 0.98
@@ -122,7 +122,7 @@ def component_through(manifold: ConstraintManifold, x: Array) -> SelfMotion:
 
 
 def _random(manifold: ConstraintManifold, rng: np.random.Generator) -> Array:
-    """Return random postures on the manifold and within the limits; they may violate inequalities."""
+    """Return random postures on the manifold and within the joint limits; inequalities are ignored."""
     projected = manifold.project(manifold.draw(rng, _BATCH, manifold.problem.given), within=True)
     return projected.x[projected.converged]
 

@@ -16,7 +16,7 @@ from impact_posture.posture.constraints.posture_distance import distance_gradien
 from impact_posture.posture.program.constrained_problem import RANK_TOLERANCE, ConstrainedProblem, held_rows
 from impact_posture.system.arrays import Array, nonnegative_least_squares, null_space
 
-# Only an inequality closer to its bound than this (m, rad) can have a multiplier.
+# An inequality can have a multiplier only if the distance from its bound is below this value (m, rad).
 _ACTIVE = 1e-3
 # If the objective is a maximum, functions up to this fraction of the initial objective f₀ below the maximum
 # contribute a gradient.  The tolerance of complementarity is twice this fraction.
@@ -99,8 +99,8 @@ def certify(
     """Compute the certificate of the posture ``q``.
 
     ``scale`` is the initial objective f₀.  ``auxiliaries`` are the values of the auxiliary unknowns of the
-    constraints at ``q``, by default :meth:`ConstrainedProblem.guess`.  A model ``numeric`` that the caller passes is
-    set to ``q``.
+    constraints at ``q``, by default :meth:`ConstrainedProblem.guess`.  If ``numeric`` is given, the function sets it
+    to ``q``.
     """
     numeric = (numeric or Numeric(problem.robot.model)).at(q)
     gradients, gaps = objective_gradients(problem, q, scale)
@@ -110,7 +110,7 @@ def certify(
     errors = [c.pose_error(part.value) for c, part in zip(problem.constraints, parts, strict=True)]
     rows, limits = Linearization.joined(parts, problem.robot.nv), linearized_limits(problem, q)
     near: list[_NearBound] = []
-    # For a posture that violates the constraints, multipliers would take long to compute and could not certify it.
+    # If a posture violates the constraints, multipliers could not certify it and would take long to compute.
     if rows.violation <= _HOPELESS:
         near = _near_bounds(Linearization.joined([rows, limits], problem.robot.nv))
     jacobian = np.hstack([rows.posture, rows.auxiliary])
@@ -168,7 +168,7 @@ def _near_bounds(rows: Linearization) -> list[_NearBound]:
 
 
 def _active(near: Sequence[_NearBound], multipliers: Array) -> tuple[Active, ...]:
-    """Return the inequalities with a multiplier; multipliers of rows with the same name are added.
+    """Return the inequalities with a multiplier; multipliers of rows with equal names are summed up.
 
     Rows without a name are part of a named row and are left out.
     """
@@ -189,11 +189,11 @@ def linearized_limits(problem: ConstrainedProblem, q: Array) -> Linearization:
 
 
 def _multipliers(gradients: Array, equalities: Array, near: Sequence[_NearBound]) -> tuple[Array, Array, Array]:
-    """Return weights of ``gradients`` (≥ 0, sum 1), multipliers of ``near`` (≥ 0), and the smallest residual.
+    """Return weights of ``gradients`` (≥ 0, sum 1), multipliers of ``near`` (≥ 0), and the least-squares residual.
 
     Multipliers of equalities can have any sign, so all gradients are projected onto the null space of the equalities.
-    The products of multipliers and slacks are added to the residual.  Without these products, a bound that is near
-    but inactive could replace an active one.
+    The products of multipliers and slacks are added to the residual.  Without these products, a nearby inactive bound
+    could replace an active bound.
     """
     count = len(gradients)
     free = null_space(equalities, RANK_TOLERANCE)

@@ -92,7 +92,7 @@ def _cached(problem: ConstrainedProblem, options: dict[str, Any]) -> ca.Function
     try:
         return ca.nlpsol("posture", "ipopt", str(library), options)
     except RuntimeError:
-        # The library cannot be loaded; for example, another machine with the same cache folder built it.
+        # The library cannot be loaded, for example because another machine that shares the cache folder built it.
         library.unlink(missing_ok=True)
         return None
 
@@ -105,7 +105,7 @@ def _pays(solver: ca.Function, starts: int) -> bool:
 def _key(problem: ConstrainedProblem) -> str:
     """Return a hash of all numbers in the functions.
 
-    Targets, limits and the normal of the first contact are parameters, so they are not included.
+    The hash omits targets, limits and the normal of the first contact, because they are parameters.
     """
     content = [
         ca.CasadiMeta.version(),
@@ -134,7 +134,7 @@ def _compile(solver: ca.Function, compiler: list[str], name: str) -> None:
 
 
 def _shared(function: ca.Function) -> ca.Function:
-    """Return a function that computes equal subexpressions once; differentiation creates many of them."""
+    """Return a function that computes equal subexpressions, which differentiation creates, only once."""
     inputs = function.sx_in()
     names = (function.name_in(), function.name_out())
     return ca.Function(function.name(), inputs, function.call(inputs), *names, {"cse": True})

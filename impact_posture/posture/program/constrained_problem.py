@@ -83,7 +83,7 @@ class ConstrainedProblem:
 
     @property
     def grows(self) -> bool:
-        """Whether the program may lack rows, which :meth:`grown` then adds."""
+        """Whether the program may lack rows that :meth:`grown` can add."""
         return any(c.grows for c in self.constraints)
 
     def grown(
@@ -92,7 +92,7 @@ class ConstrainedProblem:
         """Return the problem with the rows that the program lacks at the postures, or ``self`` if none are missing.
 
         If the postures are final postures of runs, ``auxiliaries`` are the final auxiliary unknowns of these runs,
-        shape (k,) each.  A model ``numeric`` that the caller passes is set to the last posture.
+        shape (k,) each.  If ``numeric`` is given, the method sets it to the last posture.
         """
         constraints, numeric = list(self.constraints), numeric or Numeric(self.robot.model)
         for index, q in enumerate(postures):

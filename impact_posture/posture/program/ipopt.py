@@ -30,12 +30,12 @@ IPOPT_OPTIONS: dict[str, Any] = {
     "ipopt.bound_relax_factor": 0.0,
     "ipopt.honor_original_bounds": "yes",
     "ipopt.mu_strategy": "adaptive",
-    # All rows have similar sizes, so scaling and permuting each matrix takes MUMPS longer than it saves.
+    # All rows have similar sizes, so scaling and permuting each matrix would take MUMPS more time than it would save.
     "ipopt.mumps_scaling": 0,
     "ipopt.mumps_permuting_scaling": 0,
     "ipopt.max_iter": 300,
     "print_time": False,
-    # IPOPT rejects a step whose functions overflow, so the warnings of CasADi about them are not errors.
+    # IPOPT rejects a step at which functions overflow, so warnings of CasADi about the overflow are hidden.
     "show_eval_warnings": False,
     "calc_lam_p": False,
     # Do not compute sensitivities of the solution, because they are not used.

@@ -1,4 +1,4 @@
-"""The nonlinear program that is built once and solved for many starts, normals and targets."""
+"""The nonlinear program, which is built once and solved from many starts and for many normals and targets."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from impact_posture.posture.program.program import Program, parameters
 from impact_posture.posture.program.program_rows import ProgramRows
 from impact_posture.system.arrays import Array
 
-# Penalty per meter of :attr:`LiftedRows.slack`, in units of the initial objective.  It must exceed the decrease of
-# the objective per meter of slack.  With a penalty of 2, the solutions still had slack.
+# Penalty per meter of :attr:`LiftedRows.slack`, in units of the initial objective.  The penalty must exceed the
+# decrease of the objective per meter of slack.  With a penalty of 2, solutions had slack.
 SLACK_PRICE = 50.0
 # Counter for the identifiers of the programs in this process.
 _NUMBERS = count()
@@ -51,8 +51,8 @@ class SolveRecord:
     """Result of a solver run: posture, status and iterations of IPOPT, and wall time of the call.
 
     ``auxiliaries`` are the final values of the auxiliary unknowns of the constraints, shape (k,).  ``minimized`` is
-    the final value of the function that the solver minimizes, in units of the scale.  ``end`` contains all values
-    that a warm start needs.
+    the final value of the function that the solver minimizes, divided by the scale.  ``end`` contains all values that
+    a warm start needs.
     """
 
     q: Array
@@ -198,7 +198,7 @@ def build_nlp(
     program: Program | None = None,
     rows: ProgramRows | None = None,
 ) -> PostureNLP:
-    """Build the program for ``starts`` runs; this number decides whether compiling saves time.
+    """Build the program for ``starts`` runs; their number decides whether compiling saves time.
 
     ``program`` is a program of the same problem with fewer rows; its expressions are reused.  ``rows`` are the rows
     of the constraints, if they are already built.

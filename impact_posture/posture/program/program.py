@@ -56,7 +56,7 @@ class Program:
         """Return the expressions of a problem and options of ``nlpsol``.
 
         The expressions are ``x`` (unknowns), ``p`` (parameters), ``f`` and ``g``.  If rows can be added to the
-        problem, the options supply its derivatives; otherwise they are empty.
+        problem, the options supply derivatives; otherwise, there are no options.
         """
         rows, objective = self.rows.lift(problem), self.lifted
         x = ca.vertcat(self.rows.x, objective.variables, rows.variables)
@@ -74,7 +74,7 @@ class Program:
 
     @cached_property
     def fixed(self) -> Derivatives:
-        """Derivatives of objective value, quaternion norms and objective rows, unchanged when constraints grow."""
+        """Derivatives of objective, quaternion norms and objective rows, which stay when constraints grow."""
         objective, nx, norms = self.lifted, self.chart.nx, self.rows.norms
         rows = ca.vertcat(self.value, norms, objective.rest, objective.inequalities)
         derivatives = Derivatives.of(rows, ca.vertcat(self.rows.x, objective.variables))

@@ -56,7 +56,7 @@ class Derivatives:
 
 
 class ProgramRows:
-    """Rows of the constraints of a problem, with all rows added so far; all programs of the problem share them.
+    """Rows of the constraints of a problem, including all added rows, which all programs of the problem share.
 
     Attributes:
         x: Chart coordinates, shape (nx, 1).
@@ -116,7 +116,7 @@ class ProgramRows:
                 columns[id(piece.rows)] = range(column, column + piece.variables.numel())
                 column += piece.variables.numel()
         self._differentiate(list(pieces.values()))
-        # The first, empty part ensures the right shapes of the matrices even if there are no rows.
+        # The first part is empty.  It gives the matrices the right shapes even if there are no rows.
         parts, order = [Derivatives(ca.SX(0, 1), ca.SX(0, nx), ca.SX(nx, nx))], list[int]()
         at = [k for _, block in self._blocks for piece in block for k in columns[id(piece.rows)]]
         for derivatives, block in self._blocks:
@@ -130,7 +130,7 @@ class ProgramRows:
         return Derivatives(multipliers[new_rows], J[new_rows, new_columns], H[new_columns, new_columns])
 
     def _of_sides(self, piece: LiftedRows) -> Derivatives:
-        """Return the cached derivatives of :attr:`LiftedRows.sides` of a piece."""
+        """Return the cached derivatives of :attr:`LiftedRows.sides` of the piece ``piece``."""
         if piece not in self._sides:
             self._sides[piece] = Derivatives.of(piece.sides, piece.variables)
         return self._sides[piece]

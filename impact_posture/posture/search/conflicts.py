@@ -18,10 +18,10 @@ from impact_posture.posture.program.ipopt import IPOPT_OPTIONS, run_solver
 from impact_posture.posture.program.program_rows import Derivatives, ProgramRows, joined
 from impact_posture.system.arrays import Array
 
-# A violation below this (m, rad) counts as satisfied.
+# A constraint is treated as satisfied if its violation is below this value (m, rad).
 _KEPT = 1e-6
 # Penalty per meter of penetration between bodies, lower than the penalty 1 per meter of a violated pose.  If a body
-# blocks a pose, the body is therefore reported as the conflict, not the pose.
+# blocks a pose, the conflict that is reported is therefore the body and not the pose.
 _SLACK_PRICE = 0.03
 # Weight of the squared distance from the given posture.  This term makes the solution unique.
 _AWAY_PRICE = 1e-6
@@ -30,8 +30,8 @@ _TRIES = 24
 # Maximum number of random postures from which the starts are chosen.  The postures farthest from all bodies often
 # lead to a feasible posture when arbitrary postures do not.
 _DRAWN = 200
-# Number of starts that confirm a conflict known from a nearby target. For panda in front of a wall, two starts are
-# needed to find a way around a body.
+# Number of starts after which a conflict is confirmed that is known from a nearby target.  For panda in front of a
+# wall, two starts are needed to find a way around a body.
 _CONFIRMING = 4
 # Number of random postures that are drawn first.  These postures usually suffice, and drawing all ``_DRAWN`` postures
 # takes longer than solving the program of a small robot.
@@ -99,7 +99,7 @@ def _starts(problem: ConstrainedProblem, chart: Chart, seed: int) -> Iterator[Ar
 
 
 def _relax(problem: ConstrainedProblem, chart: Chart, program: ElasticProgram, start: Array) -> LeastViolation:
-    """Minimize the slack from one start; the problem in the result contains the rows that the program lacked."""
+    """Minimize the slack from one start; rows that the program lacked are added to the problem in the result."""
     lower_rows, upper_rows = problem.row_bounds
     norms = np.zeros(len(chart.quaternion_slices()))
     x = np.clip(chart.to_x(start), problem.lower, problem.upper)
@@ -136,7 +136,7 @@ class ElasticProgram:
         self._fixed = Derivatives.of(ca.vertcat(self._away, rows.norms), rows.x)
 
     def solver(self, problem: ConstrainedProblem) -> ca.Function:
-        """Return ``nlpsol`` for the first problem, or for this problem with another target or additional rows."""
+        """Return ``nlpsol`` for the problem of the constructor, also with another target or additional rows."""
         self.problem, structure = problem, problem.structure
         if self._latest is None or self._latest[0] != structure:
             self._latest = structure, self._solver(problem)

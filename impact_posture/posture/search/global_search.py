@@ -1,8 +1,8 @@
 """Global search: the adaptive search, then a complete map if one or two degrees of freedom are left.
 
-The map (:mod:`impact_posture.posture.manifold.self_motion`) bounds how much lower than the best value the objective
-can be.  With more degrees of freedom, the adaptive search (:mod:`impact_posture.posture.search.screening`) already
-contains the basin hopping.
+The map of the self-motion (:mod:`impact_posture.posture.manifold.self_motion`) bounds how far the objective can be
+below the best objective.  With more degrees of freedom, the adaptive search
+(:mod:`impact_posture.posture.search.screening`) already contains the basin hopping.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _BETTER = 1e-6
 # A start missed the best posture if the objective at its end is more than this fraction above the best objective.
 _MISSED = 1e-3
 _KEYS = ("redundancy", "improvement", "missed_rate", "unseen_share", "estimated_optima", "hops", "word", "line")
-# Attributes of a solution that describe the search before the map.
+# Attributes of a solution that describe the search before the manifold is mapped.
 _OF_THE_STARTS = (
     "optima", "estimate", "starts", "feasible_starts", "certified_starts", "dominated_starts", "solve_time_s",
     "build_time_s",
@@ -51,7 +51,7 @@ class SelfMotionMap:
         objective: Objective at each node, shape (N,).
         feasible: Whether each node satisfies the joint limits and inequalities, shape (N,).
         start, optimum: Index of the node nearest to the initial and to the best posture, shape (1,).
-        ends: Index of the node nearest to each optimum of the search before the map, shape (M,).
+        ends: Index of the node nearest to each optimum of the preceding search, shape (M,).
     """
 
     q: Array
@@ -70,7 +70,7 @@ class GlobalSearch:
 
     Attributes:
         redundancy: Number of degrees of freedom that remain under the equality constraints.
-        improvement: Relative decrease of the objective below the best objective before the map.
+        improvement: Relative decrease of the best objective by the map.
         missed_rate: Share of the certified starts whose final objective is more than 0.1 % above the best objective.
         unseen_share, estimated_optima, hops: As in the estimate of the solution
             (:class:`~impact_posture.posture.search.unseen_optima.SearchEstimate`).
@@ -155,12 +155,12 @@ def search_globally(
     jobs: int = JOBS,
     compile: CompileMode = "auto",
 ) -> GlobalSolution:
-    """Continue from the solution of a search whose problem passes :func:`check_searchable`.
+    """Map the self-motion after a search, and improve its solution; :func:`check_searchable` must accept the problem.
 
     ``seed`` is the seed of the random postures.
     """
     problem = solution.problem
-    # The rank drops at a singular posture, so the larger of both ranks gives the dimension of the manifold.
+    # The rank drops at a singular posture, so the larger rank of two postures gives the dimension of the manifold.
     numeric = Numeric(problem.robot.model)
     ranks = [rank(equality_jacobian(problem, numeric.at(q))) for q in (solution.initial, solution.q)]
     redundancy = problem.robot.nv - max(ranks)

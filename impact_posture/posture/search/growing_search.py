@@ -40,10 +40,11 @@ _LEAST = 2
 # A start is dominated, and stops, if its objective exceeds the best objective by this fraction.  The fraction is
 # large because the repetition of a trapped run (:attr:`SolverRun.trapped`) may end at a lower objective.
 _FAR = 0.05
-# If the runs have fewer unknowns in total, they stay in this process, because starting processes would take longer.
+# If the runs together have fewer unknowns than this, they stay in this process, because starting processes would take
+# longer.
 _FORK = 200
-# Starts that continue from postures this close (rad, m) share one run, because their runs would end at the same
-# posture.
+# Starts share one run if the postures from which they continue differ by less than this value (rad, m), because their
+# runs would end at the same posture.
 _SAME = 1e-6
 # Penalty per meter of slack when a trapped run (:attr:`SolverRun.trapped`) is repeated.
 HIGH_PRICE = 20 * SLACK_PRICE
@@ -69,8 +70,7 @@ class SolverRun:
         trapped: Whether the final posture violates a constraint although more rows would not help.  More rows do not
             help if the program already has all rows, or if slack lowers the objective by more than the penalty.  A
             trapped run is repeated with a higher penalty on slack.
-        time_s: Wall time of all runs from the start, s; the time of a run for several starts is divided equally among
-            them.
+        time_s: Wall time of all runs from the start, s; starts that share a run share its time equally.
     """
 
     start: Array | None = None
@@ -206,7 +206,7 @@ class GrowingSearch:
             # Run the first starts alone, because most other starts need the same additional rows.
             return waiting[:FIRST]
         if self._small and len(runs) == FIRST and waiting[0] < FIRST:
-            # In a small program, additional rows slow down the other starts by less than the time of another run.
+            # In a small program, the additional rows cost the other starts less time than a further run would take.
             return [k for k in waiting if k < FIRST]
         if self._finish_all or not all(k in runs for k in waiting):
             return waiting
@@ -220,7 +220,7 @@ class GrowingSearch:
         return around is None or run.record is None or not around.collisions(run.record.q)
 
     def _groups(self, waiting: list[int]) -> dict[int, list[int]]:
-        """Group starts that continue from the same posture; the first of each group runs for all."""
+        """Group starts that continue from the same posture; only the first start of a group runs."""
         groups: dict[int, list[int]] = {}
         for index in waiting:
             leader = index

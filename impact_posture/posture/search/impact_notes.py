@@ -6,7 +6,7 @@ from impact_posture.impact.objective import Objective
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.system.arrays import Array
 
-# A contact is reported as locked if its inverse effective mass falls below this share of its initial value.
+# A contact is reported as locked if its inverse effective mass falls below this fraction of the initial value.
 _LOCKED = 0.05
 
 

@@ -81,9 +81,9 @@ def _initial_posture(
 ) -> tuple[ConstrainedProblem, Array]:
     """Return the given posture moved onto the constraints, or else the first random start that reaches them.
 
-    If the start still violates constraints that the projection ignores, :class:`ElasticProgram` moves the start.  The
-    returned problem then has all rows that this program needed.  If no posture allows the speed of a strike, the
-    returned problem requires the greatest possible speed instead, unless ``beside`` is above zero.
+    If the posture still violates constraints that the projection ignores, :class:`ElasticProgram` moves the posture.
+    The returned problem then has all rows that the elastic program needed.  If no posture allows the speed of a
+    strike, the returned problem requires the greatest possible speed instead, unless ``beside`` is above zero.
 
     Raises:
         Infeasible: No posture satisfies the constraints; the error names the conflicting constraints.
@@ -127,7 +127,7 @@ def _slowed(least: LeastViolation, seed: int, program: ElasticProgram) -> LeastV
     """Return a posture for the greatest approach speed, or ``least`` if the speed does not cause the conflict.
 
     If other constraints, such as clearances, conflict with the speed, the penalties do not show the greatest speed.
-    Bisection then finds this speed.
+    Bisection then finds the greatest speed.
     """
     (approach,) = [c for c in least.problem.constraints if isinstance(c, ApproachSpeed)] or (None,)
     if approach is None or not least.conflicts:
@@ -184,13 +184,13 @@ def _remedy(problem: ConstrainedProblem, seed: int, *, struck: bool, overlap: bo
 
 
 def initial_objective(problem: ConstrainedProblem, initial: Array) -> float:
-    """Return the objective at the initial posture; this value scales the program.
+    """Return the objective at the initial posture, by which the program is scaled.
 
     Raise ``ContactError`` if the contact point cannot move along the normal, because the objective is then not
     defined.
     """
     objective = problem.objective
-    # If the point cannot move along the normal, the computed value would only be a rounding error.
+    # If the contact point cannot move along the normal, the objective would only be a rounding error.
     value = objective.value(initial) if objective.movable(initial) else 0.0
     if not (np.isfinite(value) and value > 0):
         frames = ", ".join(f"'{contact.frame}'" for contact in objective.contacts)

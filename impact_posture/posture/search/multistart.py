@@ -38,7 +38,7 @@ _DIGITS = 9
 # If the relative reduction of the objective is below this value, the result is not reported as better.  The jump is
 # the square root of the objective, so the jump then changes by less than 0.05 %.
 _NO_GAIN = 1e-3
-# With at least this number of starts, a note is added if at most one of them ended at the best optimum.
+# If a search has at least this number of starts, and at most one start ended at the best optimum, a note is added.
 _MANY = 8
 
 
@@ -61,7 +61,7 @@ class PostureSolution:
         q: The best certified posture, shape (nq,).
         redundancy: Number of degrees of freedom at ``q`` that remain under the equality constraints.
         optima: Distinct optima, best first.
-        estimate: What the search may have missed.
+        estimate: Estimate of what the search may have missed.
         feasible_starts: Number of starts that reached the constraints.
         certified_starts: Number of starts that ended at a certified posture where no original shapes touch.
         colliding_starts: Number of starts that ended at a certified posture where original shapes touch.
@@ -176,7 +176,7 @@ def solve(
     if screening is None:
         relative = np.array([o.objective for o in optima]) / max(abs(optima[0].objective), 1e-300)
         values = hits_by_value(relative, [o.hits for o in optima])
-        # It is unknown where the dominated starts would have ended.
+        # The ends of the dominated starts are unknown.
         values += (1,) * dominated
         estimate = SearchEstimate.of("multistart", values, hits_of_best(optima), bound=dominated > 0)
     else:
@@ -240,8 +240,8 @@ def distinct(
 ) -> tuple[Optimum, ...]:
     """Group final postures, given with their objectives, by optimum; the best objective comes first.
 
-    ``hits`` is the number of starts that ended at each posture, by default one.  Objectives that differ by less than
-    1e-9 of ``scale`` count as equal, and keep the order of ``ends``.
+    ``hits`` contains the number of starts that ended at each posture, by default one.  Objectives that differ by less
+    than 1e-9 of ``scale`` count as equal, and keep the order of ``ends``.
     """
     optima: list[Optimum] = []
     weighted = [(*end, count) for end, count in zip(ends, hits or [1] * len(ends), strict=True)]

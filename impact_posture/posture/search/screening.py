@@ -5,7 +5,7 @@ The objective at a posture hardly predicts the optimum to which a descent leads,
 other values to some joints, and descends again (D. J. Wales and J. P. K. Doye, "Global optimization by
 basin-hopping", J. Phys. Chem. A 1997), because many optima differ in a few joints only.  Hops from the best optimum
 alone seldom reach another optimum.  The hops that reach a better optimum often start from worse final postures.  No
-limit is a time, so a seed determines the result.
+limit depends on time, so a seed determines the result.
 """
 
 from __future__ import annotations
@@ -47,15 +47,15 @@ _HOPPING = 0.75
 # A hop starts at an optimum with a probability proportional to ``(1 + rank)^-_RANKED / (1 + hops / _TIRED)²``.  The
 # best optimum has the rank 0, and ``hops`` counts the earlier hops from this optimum.
 _RANKED, _TIRED = 0.7, 8
-# A hop gives other values to one of these shares of the joints, rounded up.
+# Fractions of the joints, rounded up, to which a hop gives other values; each hop draws one of these fractions.
 _REDRAWN = (0.1, 0.2, 0.3, 0.5)
 # Share of the hops that take the other values from another optimum.  All other hops draw random values.
 _CROSSED = 0.6
 # Distance (rad, m) below which two final postures are the same optimum if their merits differ by less than
 # ``SAME_VALUE``.
 _SAME = 0.05
-# The search stops when this number of random postures and hops from worse final postures reached the best merit, and
-# if ``_FREE``, ``_ENDS`` and ``_IDLE`` allow it.
+# The search may stop when the best merit was reached from this number of random postures and worse final postures;
+# ``_FREE``, ``_ENDS`` and ``_IDLE`` are further conditions.
 _HITS = 12
 # Degrees of freedom up to which ``_HITS`` suffices.  Each further degree of freedom doubles the number of hits,
 # because the number of optima grows exponentially with the degrees of freedom.
@@ -69,7 +69,7 @@ _IDLE = 0.5
 _GUESSES = 12
 # Limit of the number of starts times the degrees of freedom, because a solution takes longer for large robots.
 _SOLVED = 200
-# Tag of a descent from a random posture.  The tag of a hop is the end where it started.
+# Tag of a descent from a random posture.  The tag of a hop is the index of the end where the hop started.
 _RANDOM = -1
 
 
@@ -209,7 +209,7 @@ class _Search:
 
 
 def _best_and_different(points: Array, count: int) -> list[int]:
-    """Return the first postures, then postures of the better half that are farthest from all chosen postures."""
+    """Choose the best postures, then postures of the better half that are farthest from all chosen postures."""
     chosen = list(range(min(len(points), count // 2)))
     half = np.arange(len(points)) < max(count, len(points) // 2)
     while len(chosen) < min(count, int(half.sum())):

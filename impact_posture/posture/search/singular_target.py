@@ -74,7 +74,7 @@ def singular_target(problem: ConstrainedProblem, postures: Sequence[Array]) -> S
 
 
 class _Gains:
-    """Singular values of the Jacobian of a constraint, divided by the largest; held joints do not count."""
+    """Singular values of the Jacobian of a constraint, without held joints, divided by the largest singular value."""
 
     def __init__(self, problem: ConstrainedProblem, constraint: Constraint) -> None:
         self._numeric, self._constraint = Numeric(problem.robot.model), constraint
@@ -87,7 +87,7 @@ class _Gains:
 
 
 def _bent(problem: ConstrainedProblem, gains: _Gains, rank: int) -> dict[str, float]:
-    """Return positions of as few joints as possible, so that the bent posture nearly loses no direction."""
+    """Return positions of as few joints as possible, such that the bent posture is clearly not singular."""
     robot, bent, best = problem.robot, dict[str, float](), problem.given
     model, steps = robot.model, np.eye(robot.nv)
     # Only joints with a single velocity entry are bent.

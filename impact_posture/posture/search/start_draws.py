@@ -32,5 +32,5 @@ class StartDraws:
             return self._known[index]
         other = index + max(trapped - 1, 0) * self.count
         draw = StartDraw(self._problem, other, self._seed, self._known[0], self._projector)
-        # A run from a start between bodies may stay there, so more candidates are drawn after a trapped run.
+        # A run that starts between bodies may stay between them, so more candidates are drawn after a trapped run.
         return draw.choose(ATTEMPTS if trapped else CANDIDATES)

@@ -13,7 +13,7 @@ from impact_posture.config.json_block import JsonBlock
 # Rule of three.  If N starts reached every optimum at least twice, at most the fraction ``_RULE_OF_THREE / N`` of
 # further starts leads to a new optimum, with a confidence of 95 %.
 _RULE_OF_THREE = 3
-# Two objectives count as one up to this relative difference.
+# Two objectives are treated as equal up to this relative difference.
 SAME_VALUE = 5e-3
 
 
@@ -48,7 +48,7 @@ class SearchEstimate(JsonBlock):
     def of(
         method: str, hits: Sequence[int], hits_of_best: int, hops: int = 0, bound: bool = False, partial: bool = False
     ) -> SearchEstimate:
-        """Estimate from the number of starts at each objective; objectives that only hops reached have no hits."""
+        """Estimate from the number of starts at each objective that a start (not only a hop) reached."""
         share, optima = unseen_share(hits), estimated_optima(hits)
         return SearchEstimate(method, sum(hits), hops, len(hits), hits_of_best, share, optima, bound, partial)
 
