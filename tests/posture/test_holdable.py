@@ -317,7 +317,13 @@ def test_a_tight_limit_is_kept_and_has_a_multiplier() -> None:
     [
         ("ur5", (0.0, 0.0, 1.0), 3000.0, "torque of shoulder_lift_joint", r"needs [\d.]+ N·m, limit 150 N·m"),
         ("tilthex_arm", (0.0, 0.0, 1.0), 60.0, "thrust of rotor_1", r"[\d.]+ N outside 0.2534 to 9.9 N"),
-        ("borinot", (1.0, 0.0, 0.0), 3.0, "force on the base that the rotors cannot exert", r"off by [\d.]+ of the weight"),
+        (
+            "borinot",
+            (1.0, 0.0, 0.0),
+            3.0,
+            "force on the base that the rotors cannot exert",
+            r"off by [\d.]+ of the weight",
+        ),
         ("solo12", (0.0, 0.0, 1.0), 500.0, "balance of the base", r"off by [\d.]+ of the weight"),
     ],
 )
