@@ -1,4 +1,4 @@
-"""Errors that a user can correct.  All derive from :class:`ImpactPostureError` and contain a hint.
+"""Errors that a user can correct.  All errors derive from :class:`ImpactPostureError` and contain a hint.
 
 The command line prints ``what``, ``where`` and ``hint`` as one line and exits with ``exit_code``.
 """

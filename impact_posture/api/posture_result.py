@@ -35,7 +35,7 @@ from impact_posture.robot.posture_files import write_posture
 from impact_posture.system.arrays import Array
 from impact_posture.system.output_folder import whole_folder, write_json
 
-# These modules are imported inside functions, because the imports take longer than solving a small problem.
+# Functions import the following modules, because the imports take longer than solving a small problem.
 if TYPE_CHECKING:
     from impact_posture.codegen.export import Export
     from impact_posture.path.posture_path import PosturePath

@@ -31,8 +31,8 @@ _SIDES = 64
 class ContactFront:
     """The foremost point, along a given direction, of the links that move with a contact frame.
 
-    If several points are foremost (a flat front), the point nearest to a line is used.  This line goes through the
-    origin of the frame along the direction.
+    If several points are foremost (a flat front), the point nearest to the line through the origin of the frame along
+    the direction is used.
 
     Attributes:
         link: Link with the foremost point.
@@ -91,8 +91,8 @@ def contact_front(
 ) -> ContactFront | None:
     """Return the front of the links that do not move relative to a contact frame; ``None`` if they have no shapes.
 
-    These links are the link of the frame, the links welded to it, and the links behind joints that do not move.  The
-    function uses the collision shapes of a link, or its visual shapes if it has no collision shapes.
+    The front belongs to the link of the frame, the links welded to this link, and the links behind joints that do not
+    move.  The function uses the collision shapes of a link, or its visual shapes if it has no collision shapes.
 
     Args:
         robot: The robot with its shapes.
@@ -128,7 +128,7 @@ def contact_front(
 def rigid_silhouettes(robot: Robot, joint: int, held: tuple[str, ...] = ()) -> tuple[Silhouette, ...]:
     """Return the shapes of the links that do not move relative to the link of a joint while ``held`` joints rest.
 
-    Only the meshes of these links are read, and the result is cached on disk.
+    The function reads only the meshes of these links, and caches the result on disk.
     """
     described = read_shapes(robot)[0]
     group = rigid_groups(robot.model, held)

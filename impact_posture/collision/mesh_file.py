@@ -41,7 +41,7 @@ _UNIT_TAGS = {
     ".amf": rb"""<amf\b[^>]*?\bunit\s*=\s*["']([^"']*)""",
     ".3mf": rb"""<model\b[^>]*?\bunit\s*=\s*["']([^"']*)""",
 }
-# The names of units in AMF and 3MF files, m.
+# Names of units in AMF and 3MF files → length of the unit, m.
 _UNITS = {"micron": 1e-6, "millimeter": 1e-3, "centimeter": 1e-2, "inch": 0.0254, "feet": 0.3048, "foot": 0.3048}
 
 _Stamp = tuple[Path, int, int, int]

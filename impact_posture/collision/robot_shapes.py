@@ -52,8 +52,8 @@ class FittedShapes:
 class RobotShapes(FittedShapes):
     """Collision shapes and their robot; the shapes of the URDF are loaded on demand.
 
-    ``without_shapes`` contains the names of links for which the URDF describes only unusable shapes.  It also
-    contains the first link of each joint that moves a mass but no shape.
+    ``without_shapes`` contains the names of links for which the URDF describes only unusable shapes.  If a joint
+    moves a mass but no shape, its first link is also included.
     """
 
     robot: Robot

@@ -84,8 +84,9 @@ def nested_pairs(
 ) -> list[Pair]:
     """Return the pairs of nested bodies, for example a shaft in a fork.
 
-    Their hulls overlap at more than half of the postures where their shapes do not touch.  Keeping the hulls apart
-    would forbid most postures.  ``touch`` tells whether the shapes touch at given placements.
+    The hulls of nested bodies overlap at more than half of the postures where the shapes do not touch.  A constraint
+    that keeps the hulls apart would forbid most postures.  ``touch`` tells whether the shapes touch at given
+    placements.
     """
     data = robot.model.createData()
     apart, forbidden = np.zeros((2, len(pairs)), dtype=int)

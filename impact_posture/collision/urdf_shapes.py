@@ -139,7 +139,7 @@ def largest_extent(robot: Robot) -> float:
 def read_urdf_shapes(robot: Robot, first: str = "collision") -> LinkShapes:
     """Read the shapes in the URDF of a robot.
 
-    ``first`` selects the shapes of a link that has both ``collision`` and ``visual`` shapes.
+    If a link has both ``collision`` and ``visual`` shapes, only the shapes of the type ``first`` are read.
 
     Raises:
         UrdfError: The URDF has become unreadable, or its links differ from the links of the robot.

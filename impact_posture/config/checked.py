@@ -41,7 +41,7 @@ def checked(target: _Target) -> _Target:
         try:
             values = signature.bind(*arguments, **options).arguments
         except TypeError:
-            return function(*arguments, **options)  # This call raises a TypeError that names the argument.
+            return function(*arguments, **options)  # The call raises a TypeError that names the wrong argument.
         annotations = _annotations(target)
         for name, value in values.items():
             hint = hint_for(value, annotations[name]) if name in annotations else ""

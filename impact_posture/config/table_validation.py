@@ -27,7 +27,7 @@ class StrictTable:
 
 
 def validate(cls: type[_Table], data: object, where: str) -> _Table:
-    """Convert a table to a dataclass.  The error describes the first fault in one line.
+    """Convert a table to a dataclass.  If the table does not fit, the error describes the first fault in one line.
 
     Args:
         cls: Dataclass, possibly with nested dataclasses.  The ``__pydantic_config__`` of the dataclass may forbid

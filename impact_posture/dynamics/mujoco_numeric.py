@@ -21,8 +21,8 @@ from impact_posture.system.optional_package import import_mujoco
 class MujocoNumeric:
     """Compute dynamics of a robot with MuJoCo at one configuration.
 
-    The model is the MJCF from which the robot was loaded.  The result of :func:`build_mjcf` replaces this model if
-    the robot comes from a URDF, its settings contain a ``mounting``, or a frame in ``frames`` belongs to a joint.
+    The model is the MJCF from which the robot was loaded.  A model from :func:`build_mjcf` replaces the MJCF if the
+    robot comes from a URDF, its settings contain a ``mounting``, or a frame in ``frames`` belongs to a joint.
 
     The method :meth:`at`, which must be called first, sets the configuration.  All vectors and matrices are in the
     order and tangent space of Pinocchio.  Joints with an infinite armature get an armature of zero.

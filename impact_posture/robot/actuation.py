@@ -99,9 +99,9 @@ def allocation_matrix(model: pin.Model, propulsion: PropulsionSpec) -> Array:
     """Return the map from rotor thrusts (N) to the base wrench ``[force; moment]``, shape (6, rotors).
 
     In the propulsion frame, the wrench per unit thrust of a rotor is ``[d; p × d - s κ d]``, with position ``p``,
-    unit thrust direction ``d``, spin ``s`` and drag ratio ``κ``.  The result is in the axes of the base frame (the
-    root joint), about the origin of this frame.  The model must be free-flying, with the propulsion frame on the base
-    body.
+    unit thrust direction ``d``, spin ``s`` and drag ratio ``κ``.  The returned wrenches are in the axes of the base
+    frame (the root joint), about the origin of this frame.  The model must be free-flying, with the propulsion frame
+    on the base body.
     """
     if not is_free_flyer(model):
         raise SpecError("has rotors, but the base is fixed", where="propulsion", hint='set root = "free-flyer"')

@@ -1,9 +1,9 @@
 """Coupled joints: a follower moves with its leader, like the fingers of a gripper with one motor.
 
-A configuration contains both joints, and ``q_follower = ratio · q_leader + offset``.  All possible generalized
-velocities satisfy ``ν = C ν``.  The matrix ``C`` sets the velocity of the follower to the ratio times the velocity of
-the leader.  ``C`` is a projector.  The dynamics of the coupled robot have the mass matrix
-``CᵀMC`` and the Jacobian ``JC``.  The motor of the leader exerts ``Cᵀτ``.
+A configuration contains both joints, and ``q_follower = ratio · q_leader + offset``.  All generalized velocities that
+the couplings allow satisfy ``ν = C ν``.  The matrix ``C`` sets the velocity of the follower to the ratio times the
+velocity of the leader.  ``C`` is a projector.  The dynamics of the coupled robot have the mass matrix ``CᵀMC`` and
+the Jacobian ``JC``.  The motor of the leader exerts ``Cᵀτ``.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ from impact_posture.robot.joint_coupling import JointCoupling, urdf_couplings
 from impact_posture.robot.urdf_joints import clear_negative_limits, correct_joints
 from impact_posture.system.text_files import read_bytes
 
-# pin.Data always contains 6 nv³ numbers.  This is 0.4 GB for 200 degrees of freedom, and 48 GB for 1,000.
+# pin.Data always contains 6 nv³ numbers.  These numbers take 0.4 GB for 200 degrees of freedom, and 48 GB for 1,000.
 MOST_DEGREES_OF_FREEDOM = 200
 # Largest coordinate of an origin, m.  Doubles do not resolve micrometers at greater distances, and hulls fail there.
 FARTHEST = 1e10

@@ -90,8 +90,8 @@ def expand_xacro(
 
     ``arguments`` replace the defaults of ``<xacro:arg>``.  For a package in ``$(find PACKAGE)`` or in a
     ``package://`` path, the function searches ``packages``, then ``folders``, then the folders above the file, then
-    ROS.  Relative paths of meshes start from the folder of the xacro file.  They may also start from the folder above
-    that folder, where expanded files often are.
+    ROS.  Relative paths of meshes start from the folder of the xacro file, or from its parent folder, where expanded
+    files often are.
 
     Raises:
         UrdfError: The file cannot be expanded, or this takes too much time or memory.

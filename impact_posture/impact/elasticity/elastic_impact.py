@@ -18,8 +18,9 @@ k)``, ``d = (D, 0)``,
     c̈ = −A (κc + dċ),   A = C M⁻¹ Cᵀ + diag(B⁻¹, 0),   c(0) = 0,   ċ(0) = (0, v),
 
 and the impulses ``I = ∫(τ, f)dt = A⁻¹(ċ(0) − ċ)`` change the velocity of the links by ``ẋ = −M⁻¹CᵀI``.  The squared
-norm of the state ``(κ^½c, L⁻¹ċ)``, with ``A = LLᵀ``, is twice the total energy.  Only the dampers change this norm.
-Therefore the generator (the matrix of this linear system) is skew-symmetric except for the terms of the dampers.
+norm of the state ``(κ^½c, L⁻¹ċ)``, with ``A = LLᵀ``, is twice the total energy.  Only the dampers change the energy.
+Therefore the generator (the matrix of the linear system for the state) is skew-symmetric except for the terms of the
+dampers.
 """
 
 from __future__ import annotations
@@ -241,7 +242,7 @@ class _Compression:
         """Return the first root ``T`` of ``p = δ̇/v``, and the state at ``T``.
 
         The energy of the second derivative of ``c`` is ``k²v²G/2`` at touch and never increases, so ``|p̈| ≤ kG`` and
-        ``p(t+h) ≥ p + ṗh − kGh²/2``.  Each step goes to the root of this lower bound.  The steps cannot overshoot the
+        ``p(t+h) ≥ p + ṗh − kGh²/2``.  Each step goes to the root of the lower bound.  The steps cannot overshoot the
         first root of ``p``, and converge quadratically.
         """
         bound = float(self.kappa[-1] * self.mobility[-1, -1])

@@ -63,7 +63,7 @@ class ContactStability(JsonBlock):
 
     @property
     def line(self) -> str:
-        """The result as text for users."""
+        """Description of the result for users."""
         lifting = [foot.frame for foot in self.feet if foot.lifts]
         if lifting:
             return f"the impact lifts {', '.join(lifting)}, although the metric assumes that all feet stay"
@@ -160,7 +160,7 @@ class FrictionCones:
         return float(np.max(self._lifts() @ impulse, initial=0.0))
 
     def least_pull(self, particular: Array, basis: Array) -> Array:
-        """Return the possible impulses ``particular + basis z`` whose largest pull is as small as possible."""
+        """Return the impulses ``particular + basis z`` for which the largest pull of the ground is least."""
         up, count = self._lifts(), basis.shape[1]
         if not count:
             return particular
@@ -169,7 +169,7 @@ class FrictionCones:
         return particular if z is None else particular + basis @ z
 
     def within(self, particular: Array, basis: Array, friction: float) -> Array | None:
-        """Return the smallest possible impulses within the cones (maximum norm); ``None`` if there are none."""
+        """Return the impulses ``particular + basis z`` within the cones with the least maximum norm, or ``None``."""
         A, _ = self.matrix(friction)
         slack = 1e-9 * max(float(np.abs(particular).max(initial=0.0)), 1e-300)
         if not basis.shape[1]:

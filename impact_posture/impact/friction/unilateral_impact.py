@@ -1,9 +1,9 @@
 """The impact of a standing robot whose feet can lift and slide.
 
-The metric assumes that the ground can also pull the feet.  Here the ground only pushes, within the friction cone.
-Over the compression time T, the ground also carries the weight, and the motor torques do not change.  Let ``f`` be
-the force of a foot before the impact, ``P`` the whole impulse of the ground, and ``p`` the impulse of the hit
-surface:
+The metric assumes that the ground can also pull the feet.  In this module, the ground only pushes, within the
+friction cone.  Over the compression time T, the ground also carries the weight, and the motor torques do not change.
+Let ``f`` be the force of a foot before the impact, ``P`` the whole impulse of the ground, and ``p`` the impulse of
+the hit surface:
 
     ``M Δν = Jᵀp + J_sᵀ(P − fT)``.
 
@@ -89,7 +89,7 @@ class StandingFeet:
         return np.asarray(self._oracle.robot.projector @ np.linalg.solve(self.M, J.T))
 
     def _carried(self) -> Array | None:
-        """Return the forces that carry the weight: impulses that stop a rigid robot after a fall of one second."""
+        """Compute the forces that carry the weight as impulses that stop a rigid robot after a fall of 1 s."""
         model, base = self._oracle.robot.model, self.jacobian[:, :6]
         fall = np.tile(np.array(model.gravity.linear), (len(self.frames), 1))
         B = base @ np.linalg.solve(self._oracle.numeric.mass_matrix()[:6, :6], base.T)

@@ -31,10 +31,10 @@ from impact_posture.system.arrays import Array
 class ImpactKind(ABC):
     """Objective type: a multiple of H, V, S, C, E or m for a single impact along a given normal.
 
-    The class implements :class:`~impact_posture.impact.objective.WorstCase`.  It computes no maximum: either the
-    largest impulse ``λ̄`` is the worst case, or the approach speed determines the impulse.  :attr:`symbol` names the
-    attributes of :class:`ImpactOracle` and :class:`ImpactKernel` that provide value and gradient.  Subclasses define
-    the equations of the lifted form (:class:`Lifted`).
+    The class implements :class:`~impact_posture.impact.objective.WorstCase`.  An objective type computes no maximum,
+    because the largest impulse ``λ̄`` is the worst case, or the approach speed determines the impulse.
+    :attr:`symbol` names the attributes of :class:`ImpactOracle` and :class:`ImpactKernel` that provide value and
+    gradient.  Subclasses define the equations of the lifted form (:class:`Lifted`).
 
     Attributes:
         name: Name in options, files and outputs.

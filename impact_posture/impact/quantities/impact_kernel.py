@@ -1,8 +1,8 @@
 """The impact quantities and their tangent gradients as CasADi expressions, derived in ``docs/theory.md``.
 
-If supports with compliance ε keep the feet in place, ``M + J_sᵀJ_s/ε`` replaces ``M`` in every formula below.  This
-sum is the mass matrix of a robot with an additional point mass 1/ε at each foot.  The same code therefore handles
-robots with and without supports.
+If supports with compliance ε keep the feet in place, ``M + J_sᵀJ_s/ε`` replaces ``M`` in every formula below.  ``M +
+J_sᵀJ_s/ε`` is the mass matrix of a robot with an additional point mass 1/ε at each foot.  The same code therefore
+handles robots with and without supports.
 """
 
 from __future__ import annotations

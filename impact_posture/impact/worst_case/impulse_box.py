@@ -1,7 +1,7 @@
 """Worst case of several simultaneous contacts, each with its own bound on the impulse (a box of impulses).
 
 The squared jump ``‖Σ λ_i a_i‖²_W`` with ``a_i = M⁻¹J_iᵀn_i`` is a convex quadratic function ``λᵀKλ`` of the impulses,
-``K_ij = a_iᵀWa_j``.  Its maximum over ``0 ≤ λ_i ≤ λ̄_i`` is therefore at a corner of the box.  The origin is not a
+``K_ij = a_iᵀWa_j``.  The maximum over ``0 ≤ λ_i ≤ λ̄_i`` is therefore at a corner of this box.  The origin is not a
 candidate, so ``2^m − 1`` corners remain for m contacts.  If contacts can pull, the bounds are ``|λ_i| ≤ λ̄_i``.
 Opposite corners then have the same value, so ``2^(m−1)`` corners suffice.  The program is ``min t`` with ``t ≥ λᵀKλ``
 at every corner.

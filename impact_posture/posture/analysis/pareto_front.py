@@ -5,15 +5,15 @@
     f(d) = min over q  objective(q)    subject to the constraints of the problem and price(q) ≤ d
 
 The price is the distance ‖q ⊖ q₀‖ of :func:`~impact_posture.posture.constraints.posture_distance.distance_squared`,
-or the peak force of the impact.  Its bound d goes from the least price to the price of the optimum.  The price is
+or the peak force of the impact.  The bound d goes from the least price to the price of the optimum.  The price is
 bounded and not penalized, because minimizers of ``objective + w·price`` give only points on the convex hull of the
 curve.
 
-One program solves for all d, because d is the bound of one of its rows.  The problems for all bounds d are solved in
-two orders: from the least bound to the greatest, and from the greatest to the least.  Each solve starts at the result
-of the previous solve.  If this result satisfies the new bound, the solve also uses the multipliers of the previous
-solve.  For each bound, the best certified result is kept.  If the best result for a neighboring bound comes from the
-other order, one more solve starts from this result.
+One program is used for all d, because d is the bound of a row of the program.  The problems for all bounds d are
+solved in two orders: from the least bound to the greatest, and from the greatest to the least.  Each solve starts at
+the result of the previous solve.  If this result satisfies the new bound, the solve also uses the multipliers of the
+previous solve.  For each bound, the best certified result is kept.  If the best result for a neighboring bound comes
+from the other order, one more solve starts from this result.
 """
 
 from __future__ import annotations

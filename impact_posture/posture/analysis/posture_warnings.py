@@ -112,8 +112,8 @@ def _ground_warnings(prepared: Prepared, q: Array, posture: str) -> list[str]:
 def _origins(prepared: Prepared, numeric: Numeric) -> list[tuple[int, str, Array]]:
     """Return joint index, name and world origin of the links whose distances no collision constraint checks.
 
-    These are the links without shapes.  If no link has a shape, or if there are no collision constraints, all joints
-    are returned instead.
+    Links without shapes have no collision constraints.  If no link has a shape, or if there are no collision
+    constraints, all joints are returned instead.
     """
     robot, around = prepared.impact.robot, prepared.problem.surroundings
     if around is not None and around.shapes.bodies:

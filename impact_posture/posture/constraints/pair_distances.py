@@ -41,8 +41,8 @@ class PairDistances:
         margins = np.array([pair.margin for pair in self._pairs])
         self._ends = (0, self._first), (1, self._second)
         self._least = self._reach[self._first] + self._reach[self._second] + margins
-        # Corners of each hull relative to its center, in axes that turn with the body.  The last corner is repeated
-        # so that all hulls have the same number of corners.
+        # Corners of each hull relative to its center, in axes that turn with the body.  The last corner of a hull is
+        # repeated so that all hulls have the same number of corners.
         corners = [_corners(body) for body in self._bodies]
         most = max(map(len, corners), default=0)
         padded = [np.vstack([points, np.repeat(points[-1:], most - len(points), axis=0)]) for points in corners]
@@ -55,8 +55,8 @@ class PairDistances:
         self._latest = np.full(len(self._pairs), -np.inf)
         self._normals = np.zeros((len(self._pairs), 3))
         self._then = np.zeros((2, len(self._pairs), 12))
-        # The last posture, with the axes and centers of the bodies, the normals of planes, and the distances or
-        # bounds there.
+        # The last posture, and at this posture the axes and centers of the bodies, the normals of planes, and the
+        # distances or bounds.
         self._q = np.zeros(0)
         self._axes, self._centers = np.zeros((0, 3, 3)), np.zeros((0, 3))
         self._up = np.zeros((len(self._bodies), 3))
@@ -125,8 +125,8 @@ class PairDistances:
         low = (self._corners[first] @ (self._axes[first].transpose(0, 2, 1) @ along)).min(axis=1)
         high = (self._corners[second] @ (self._axes[second].transpose(0, 2, 1) @ along)).max(axis=1)
         gaps = (apart[:, None] @ along)[:, 0] + low - high
-        # The normal of a pair is zero until its exact distance is computed.  Then only the gap along the centers is
-        # used.
+        # The normal of a pair is zero until its exact distance is computed.  Until then, only the gap along the line
+        # between the centers is used.
         best = np.where(self._normals[pairs].any(axis=1), gaps.max(axis=1), gaps[:, 0])
         return np.asarray(best - self._gaps[pairs] - self._offsets[second])
 

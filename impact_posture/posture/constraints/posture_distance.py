@@ -68,7 +68,7 @@ class WithinDistance(ExpressionConstraint):
     The radius (> 0) is a row bound and the reference is a parameter, so one program serves all radii and references.
     """
 
-    unit = "in the square of rad and m"
+    unit = "rad² (m²)"
 
     def __init__(self, chart: Chart, reference: Array, radius: float) -> None:
         self.name = "distance from the initial posture"

@@ -146,9 +146,9 @@ class Surroundings:
         A point whose distance from a contact point is ``r`` along its surface has at least the distance ``clearance +
         shift + r tan(tilt)`` from this surface, to first order.  The struck links and the links that may touch the
         surface are excepted.  ``tilt`` is in degrees, and ``shift`` in m.  Surfaces that are tilted about the contact
-        point in :data:`_TILTED` directions replace all tilts up to ``tilt``.  Their tilt is slightly larger than
-        ``tilt``, so that they also cover the directions between them.  Return ``None`` if no contact has a surface,
-        or if all links may touch the surfaces.
+        point in :data:`_TILTED` directions replace all tilts up to ``tilt``.  The tilt of these surfaces is slightly
+        larger than ``tilt``, so that they also cover tilts in directions between them.  Return ``None`` if no contact
+        has a surface, or if all links may touch the surfaces.
         """
         if not (self._depths and (tilt or shift)):
             return None

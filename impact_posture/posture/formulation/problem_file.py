@@ -187,7 +187,7 @@ def resolved_settings(prepared: Prepared) -> ProblemSettings:
         **_resolved_contacts(impact),
         "posture": None,
         "q": tuple(float(v) for v in impact.q),
-        # One key `contact_pose` applies to all contacts.  If there are several contacts, the key keeps the value that
+        # The key `contact_pose` applies to all contacts.  If there are several contacts, the key keeps the value that
         # the user gave.
         "contact_pose": settings.contact_pose if wanted.other_poses else wanted.contact_pose,
         "support": tuple(f"{s.frame}:{s.kind}" for s in impact.supports),

@@ -32,8 +32,8 @@ _SURVIVES = 0.1
 # Number of random feasible postures at which ranks are compared.
 _SAMPLES = 4
 # Singular values up to this value count as zero at a projected posture, which violates the constraints by up to 1e-9.
-# Some motions are blocked only to second order, for example a sway on legs without ankle roll.  Their singular values
-# are then as large as the square root of the violation, 3e-5.
+# Some motions are blocked only to second order, for example a sway on legs without ankle roll.  The singular values
+# of such motions are as large as the square root of the violation, 3e-5.
 _BLURRED = 5e-5
 
 
@@ -92,9 +92,9 @@ def make_well_posed(problem: ConstrainedProblem) -> ConstrainedProblem:
     """Choose independent equality rows for the program, and constrain turns that are possible only to first order.
 
     Four point feet on planar legs (solo8) give 12 equations of rank 10, so two equations are redundant.  To first
-    order, the base can roll, although any finite roll would spread the feet.  Both the redundant equations and this
-    roll prevent the solver from converging.  So the program omits the redundant rows, which the certificate still
-    checks, and a constraint blocks the roll.
+    order, the base can roll, although any finite roll would spread the feet.  The redundant equations and the roll
+    prevent the solver from converging.  So the program omits the redundant rows, which the certificate still checks,
+    and a constraint blocks the roll.
     """
     numeric = Numeric(problem.robot.model)
     jacobian = equality_jacobian(problem, numeric.at(problem.given))

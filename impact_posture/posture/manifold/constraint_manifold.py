@@ -1,7 +1,7 @@
 """The constraint manifold of a posture problem, evaluated at many postures at once.
 
 The functions of the program evaluate one posture at a time.  Here, a batch of postures is evaluated, and NumPy solves
-the small linear systems of the batch together.  This takes about 0.1 ms for each posture of talos.
+the small linear systems of the batch together.  The evaluation takes about 0.1 ms for each posture of talos.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class MeritEvaluation:
         equalities: Values ``c``, shape (N, m).
         jacobian: Tangent Jacobian of the equalities, shape (N, m, nv).
         merit: ``ln f + μ Σ e²``, shape (N,), with the objective ``f`` and the violations ``e`` of the inequalities
-            onto which postures are projected.  The value is not finite where the objective is not defined.
+            onto which postures are projected.  The merit is not finite where the objective is not defined.
         gradient: Tangent gradient of the merit, shape (N, nv).
     """
 

@@ -21,7 +21,7 @@ _ACTIVE = 1e-3
 # If the objective is a maximum, functions up to this fraction of the initial objective f₀ below the maximum
 # contribute a gradient.  The tolerance of complementarity is twice this fraction.
 _TIED = 5e-8
-# Weight of complementarity relative to stationarity; it equals the ratio of their tolerances.
+# Weight of complementarity relative to stationarity, equal to the ratio of the tolerances of the two.
 _COMPLEMENTARITY = 10.0
 # If the violation (m, rad) exceeds this value, no multipliers are computed, because the posture cannot be certified.
 _HOPELESS = 1e-4
@@ -137,8 +137,8 @@ def certify(
 def objective_gradients(problem: ConstrainedProblem, q: Array, scale: float) -> tuple[Array, Array]:
     """Return the gradients, shape (k, nv), and the gaps, shape (k,), of :class:`Subgradients`, divided by ``scale``.
 
-    The gradients include the regularization.  Their convex combinations are the subdifferential of the function that
-    is minimized.  If the minimized function is smooth at ``q``, k = 1.
+    The gradients include the regularization.  The convex combinations of the gradients are the subdifferential of the
+    minimized function.  If the minimized function is smooth at ``q``, k = 1.
     """
     members = problem.objective.subgradients(q, _TIED * scale)
     gradients = members.gradients / scale

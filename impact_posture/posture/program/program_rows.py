@@ -116,7 +116,7 @@ class ProgramRows:
                 columns[id(piece.rows)] = range(column, column + piece.variables.numel())
                 column += piece.variables.numel()
         self._differentiate(list(pieces.values()))
-        # The first part is empty.  It gives the matrices the right shapes even if there are no rows.
+        # The first part is empty, and gives the matrices the right shapes even if there are no rows.
         parts, order = [Derivatives(ca.SX(0, 1), ca.SX(0, nx), ca.SX(nx, nx))], list[int]()
         at = [k for _, block in self._blocks for piece in block for k in columns[id(piece.rows)]]
         for derivatives, block in self._blocks:

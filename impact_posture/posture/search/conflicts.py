@@ -23,7 +23,7 @@ _KEPT = 1e-6
 # Penalty per meter of penetration between bodies, lower than the penalty 1 per meter of a violated pose.  If a body
 # blocks a pose, the conflict that is reported is therefore the body and not the pose.
 _SLACK_PRICE = 0.03
-# Weight of the squared distance from the given posture.  This term makes the solution unique.
+# Weight of the squared distance from the given posture.  The weight makes the solution unique.
 _AWAY_PRICE = 1e-6
 # Maximum number of starts.
 _TRIES = 24

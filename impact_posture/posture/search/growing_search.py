@@ -186,7 +186,7 @@ class GrowingSearch:
         return [runs[index] for index in range(starts)]
 
     def _grow(self, owed: list[tuple[SolveRecord, ConstrainedProblem]]) -> None:
-        """Add the rows that the program lacks at results, which are given with the problem of their run."""
+        """Add the rows that the program lacks at the given results; each result comes with its problem."""
         # The auxiliary unknowns of a result are valid only for the program that was solved.
         now = [record for record, problem in owed if problem is self.problem]
         before = [record.q for record, problem in owed if problem is not self.problem]
@@ -262,8 +262,8 @@ class GrowingSearch:
                 record, certificate = run_start(nlp, start, scale, price, record)
             objective = problem.objective.value(record.q)
         except MetricError:
-            # The objective is not defined at the final posture of the run.  This start ends without a result, and
-            # the other starts continue.
+            # The objective is not defined at the final posture of the run.  The start then has no result, and the
+            # other starts continue.
             return SolverRun(start)
         minimized = objective / scale
         if problem.requirements.regularization:

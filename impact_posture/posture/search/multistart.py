@@ -176,7 +176,7 @@ def solve(
     if screening is None:
         relative = np.array([o.objective for o in optima]) / max(abs(optima[0].objective), 1e-300)
         values = hits_by_value(relative, [o.hits for o in optima])
-        # The ends of the dominated starts are unknown.
+        # The ends of the dominated starts are unknown, so each counts as an objective with one hit.
         values += (1,) * dominated
         estimate = SearchEstimate.of("multistart", values, hits_of_best(optima), bound=dominated > 0)
     else:

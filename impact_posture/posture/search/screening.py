@@ -183,7 +183,7 @@ class _Search:
             projection = projector.project(self._manifold.to_q(self.ends.x[self._end[k]]))
             if projection.violation <= FEASIBLE:
                 guesses[k] = projection.q
-        # It is unknown where the stuck descents would have ended.
+        # The ends of the stuck descents are unknown, so each counts as an objective with one hit.
         stuck = (1,) * int((self.descent.stuck == _RANDOM).sum())
         values = hits_by_value(self.ends.merit, self.ends.tag == _RANDOM) + stuck
         return Screening(
