@@ -85,7 +85,6 @@ class _Source:
     links: tuple[str, ...]
 
     def without_shapes(self, used: Collection[str]) -> tuple[str, ...]:
-        """Return :attr:`RobotShapes.without_shapes`; ``used`` are the links whose shapes are used."""
         model, bare = self.robot.model, list[str]()
         frames = [frame for frame in model.frames if frame.type == pin.FrameType.BODY]
         covered = {0, *(int(frame.parentJoint) for frame in frames if frame.name in used)}
@@ -98,7 +97,6 @@ class _Source:
         return tuple(bare)
 
     def all_warnings(self, used: Collection[str], warnings: Iterable[str]) -> tuple[str, ...]:
-        """Return all warnings about shapes; ``warnings`` come from loading the shapes of the links ``used``."""
         words, bare = [] if used else [NO_SHAPES], self.without_shapes(used)
         if used and bare:
             named = f"links without shapes: {listed(bare)}"

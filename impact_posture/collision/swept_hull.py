@@ -119,7 +119,6 @@ def distance_from_hull(point: Array, hull: SweptHull) -> float:
 
 
 def _measure(a: Any, at_a: pin.SE3, b: Any, at_b: pin.SE3) -> tuple[float, Any]:
-    """Return the distance of two coal shapes, m, and the result of coal."""
     result = coal.DistanceResult()
     distance = coal.distance(a, transform(at_a), b, transform(at_b), _REQUEST, result)
     if not np.isfinite(result.normal).all():

@@ -60,8 +60,6 @@ class _Named:
 
 
 class _Names(dict[str, Any]):
-    """Names of a module, with a stand-in for each missing name."""
-
     def __missing__(self, name: str) -> type:
         return type(name, (_Named,), {})
 
@@ -183,7 +181,6 @@ def _is_float(value: Any) -> bool:
 
 
 def _words(annotation: Any) -> str:
-    """Return the readable name of a type for a message."""
     origin, parts = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         return next((part.words for part in parts if isinstance(part, Demand)), _words(parts[0]))

@@ -116,7 +116,6 @@ def draft_spec(located: Located, options: LoadOptions, folder: Path) -> Draft:
 
 
 def _header(robot: Robot, feet: Sequence[str]) -> Draft:
-    """Return a draft with the keys above the tables."""
     draft = Draft(
         comment_lines(
             f"Data of {robot.name} that its {_file(robot, 'URDF')} cannot hold, drafted by impact-posture inspect "
@@ -138,7 +137,6 @@ def _header(robot: Robot, feet: Sequence[str]) -> Draft:
 
 
 def _postures(draft: Draft, robot: Robot) -> None:
-    """Add an example of a posture if the robot has no usable posture."""
     if guess.start_posture(robot) == "neutral" and robot.joint_names:
         base = ("base = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]",) if robot.floating else ()
         draft.note(
@@ -151,7 +149,6 @@ def _postures(draft: Draft, robot: Robot) -> None:
 
 
 def _load(located: Located, options: LoadOptions, root: Root | None, srdf: Path | None) -> Robot:
-    """Load the robot without a robot.toml; impossible inertias become warnings."""
     plain = LoadOptions(armature=options.armature, lock=options.lock, lock_massless=True)
     spec = RobotSpec(model=ModelSpec(root=root, accept_inertias=True))
     return build_robot(located._replace(spec=spec, files=replace(located.files, srdf=srdf)), plain)

@@ -110,7 +110,6 @@ class JumpDerivatives:
 
     @cached_property
     def _mass(self) -> ca.SX:
-        """Mass matrix ``M``, shape (nv, nv)."""
         products = self._momenta.T @ self._subspaces
         below = _kept(products, self._lies_on(self._of_v, self._of_v) & np.tri(len(self._of_v), dtype=bool))
         return ca.tril2symm(below) + ca.diag(self._tree.armature)
@@ -206,7 +205,6 @@ class JumpDerivatives:
 
 
 def _kept(matrix: ca.SX, pattern: Array) -> ca.SX:
-    """Remove the entries of a matrix where the pattern is False."""
     return matrix * ca.sparsify(ca.SX(pattern.astype(float)))
 
 

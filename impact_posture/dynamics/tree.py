@@ -268,7 +268,6 @@ class Tree(Kinematics):
         return 1 / mobility if mobility.is_scalar() else mobility
 
     def _free_response(self, tau: ca.SX | None, wrenches: Sequence[Wrench]) -> Response:
-        """Return the response without couplings between joints at different links."""
         bias: ByJoint = dict.fromkeys(self._R, _ZERO)
         for wrench in wrenches:
             bias[wrench.point.joint] = bias[wrench.point.joint] - self.link_force(wrench)

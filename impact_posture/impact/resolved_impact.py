@@ -93,7 +93,6 @@ def choose_objective(settings: ImpactSettings, *, several: bool) -> tuple[Object
 
 
 def _automatic(settings: ImpactSettings, *, several: bool) -> tuple[ObjectiveKind, str]:
-    """Return the objective type that ``auto`` chooses, and the reason for it."""
     if several:
         return "impulse", "objective impulse: for several contacts at once, only bounds on the impulses are known"
     if settings.speed == 0:

@@ -49,7 +49,6 @@ def joints_to(robot: Robot, frame: str) -> list[str]:
 
 
 def _links(robot: Robot, joint: int) -> list[str]:
-    """Return the names of the links and sites that move with a joint."""
     return [str(f.name) for f in robot.model.frames if f.parentJoint == joint and is_link(f)]
 
 

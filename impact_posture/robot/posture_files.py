@@ -160,7 +160,6 @@ def _in_order(robot: Robot, data: Mapping[str, object], where: str) -> Array:
 
 
 def _by_name(robot: Robot, q: Array, data: Mapping[str, object], where: str) -> Array:
-    """Return ``q`` with the base and the joints that the file gives by name."""
     joints, base, q = data.get("joints", {}), data.get("base"), q.copy()
     if not isinstance(joints, dict):
         raise PostureError("'joints' is not a table", where=where, hint='write "joints": {"name": value}')

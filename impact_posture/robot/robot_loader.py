@@ -289,7 +289,6 @@ def _beside(model: pin.Model) -> tuple[str, ...]:
 
 
 def _immovable(model: pin.Model) -> list[str]:
-    """Return a warning about joints whose position limits are equal."""
     if not (joints := immovable_joints(model)):
         return []
     held = f"joints with equal position limits are held at them: {listed(joints)}"

@@ -94,7 +94,6 @@ def _joint(robot: Robot, name: str) -> dict[str, Any]:
 
 
 def _frames(robot: Robot) -> list[dict[str, Any]]:
-    """Return the frame that :meth:`Robot.frame_id` selects for each name."""
     frames = [robot.model.frames[robot.frame_id(name)] for name in dict.fromkeys(robot.frame_names)]
     names = robot.model.names
     return [{"name": str(f.name), "joint": str(names[f.parentJoint]), "link": is_link(f)} for f in frames]

@@ -55,7 +55,6 @@ def largest_entries(robot: Robot, values: Array) -> tuple[tuple[str, float, str]
 
 
 def _largest(sizes: Array, count: int) -> list[int]:
-    """Return indices of the ``count`` largest sizes, in descending order; omit sizes below 0.1 % of the largest."""
     order = np.argsort(-sizes, kind="stable")[:count]
     return [int(k) for k in order if sizes[k] > 1e-3 * sizes[order[0]]]
 

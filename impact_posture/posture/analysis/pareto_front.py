@@ -122,7 +122,6 @@ class _End:
 
     @property
     def rank(self) -> tuple[bool, float]:
-        """Sort key: certified points first, then by objective."""
         return not self.point.certified, self.point.objective
 
 
@@ -246,7 +245,6 @@ class _Curve:
         )
 
     def finish(self, solution: PostureSolution, solve: float, build: float, notes: list[str]) -> TradeOff:
-        """Return the finished curve with notes."""
         points: list[TradePoint] = []
         for k, end in enumerate(self._best):
             # If no result satisfies the constraints, use the posture of the previous bound, which satisfies them.

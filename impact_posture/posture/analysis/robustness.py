@@ -210,7 +210,6 @@ def _apart(problem: ConstrainedProblem, postures: Sequence[Array]) -> list[Array
 
 
 def _broken(problem: ConstrainedProblem, q: Array) -> list[str]:
-    """Return the names of the constraints that a posture violates."""
     violations = problem.violations(Numeric(problem.robot.model).at(q))
     pairs = zip(problem.constraints, violations, strict=True)
     return [constraint.name for constraint, excess in pairs if np.abs(excess).max(initial=0.0) > _NOISE]

@@ -116,7 +116,6 @@ def verdict(
 
 
 def _sentence(outcome: str, refuted: bool, later: bool) -> str:
-    """Return the outcome as the start of a sentence; ``later`` if other sentences come before it."""
     if refuted:
         return f"If it arrived, it would be {outcome}"
     return outcome.capitalize() if later else outcome

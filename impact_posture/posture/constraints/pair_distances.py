@@ -132,7 +132,6 @@ class PairDistances:
 
 
 def _corners(body: ConvexBody) -> Array:
-    """Return the corners of a hull relative to its center, or the origin for a half-space."""
     if body.hull is None:
         return np.zeros((1, 3))
     corners = body.hull.vertices - body.hull.center

@@ -222,5 +222,4 @@ def base_point() -> PointOnLink:
 
 
 def _coefficients(rotation: Array) -> Array:
-    """Return the unit quaternion x y z w of a rotation matrix."""
     return np.array(pin.Quaternion(np.asarray(rotation)).coeffs())

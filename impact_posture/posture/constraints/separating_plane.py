@@ -201,7 +201,6 @@ class SeparatingPlane:
         return Corners(frozenset(range(first)), frozenset(range(second)))
 
     def _relative(self, tree: Tree) -> tuple[ca.SX, ca.SX]:
-        """Return the rotation and position of ``a`` in the axes of ``b``."""
         if self.b.turns:
             R, p = tree.relative(self.b.point.joint, self.a.point.joint)
             axes = ca.SX(self.b.point.rotation).T

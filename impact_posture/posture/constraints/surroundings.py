@@ -292,7 +292,6 @@ class Surroundings:
         return "the base" if not self.robot.floating and self._above(root, plane) < -_BEHIND else ""
 
     def _fixed(self, pair: SeparatingPlane) -> bool:
-        """Return whether held joints fix the two bodies to each other."""
         return self._group[pair.a.point.joint] == self._group[pair.b.point.joint]
 
     def _rigid(self, joints: Iterable[int]) -> frozenset[int]:
@@ -301,7 +300,6 @@ class Surroundings:
         return frozenset(k for k, group in enumerate(self._group) if group in groups)
 
     def _world_normal(self, contact: ImpactContact) -> Array:
-        """Return the normal of a contact at the given posture in world axes, shape (3,)."""
         n = np.array(contact.normal)
         if contact.normal_frame == "world":
             return n

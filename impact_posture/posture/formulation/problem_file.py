@@ -225,7 +225,6 @@ def _resolved_contacts(impact: ResolvedImpact) -> dict[str, object]:
 
 
 def _resolved_variants(variants: Sequence[ModelVariant]) -> dict[str, object]:
-    """Return the settings ``armature_range`` and ``payload`` that define these model variants."""
     # The nominal robot is always one of the variants.
     factors = {variant.armature_factor for variant in variants} - {1.0}
     if len(factors) == 1:

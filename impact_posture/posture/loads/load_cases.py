@@ -189,7 +189,6 @@ def _feet(objective: Objective, weight: float, friction: float) -> list[ForceSou
 
 
 def _push(robot: Robot, contact: ImpactContact, force: float) -> ForceSource:
-    """Return the force of the surface on the robot along the normal."""
     point = point_on(robot, contact.frame, contact.offset)
     wrench = np.append(force * np.array(contact.normal), np.zeros(3))
     return ForceSource(point, in_frame=contact.normal_frame == "contact", constant=wrench)

@@ -50,7 +50,6 @@ class _Rows:
     """Arrays with a row for each posture."""
 
     def taken(self, rows: NDArray[np.bool_]) -> Self:
-        """Return the rows at which a mask is true."""
         return type(self)(*[getattr(self, field.name)[rows] for field in fields(self)])
 
     def joined(self, other: Self) -> Self:
@@ -191,7 +190,6 @@ class BatchDescent:
         return _Points(x, merit, np.where(before, rest, 0.0), tangent, back, residual)
 
     def _turn(self) -> None:
-        """Choose the next direction of each descent."""
         s = self._state
         s.direction = -times(s.tangent, times(s.hessian, s.gradient))
         slope = (s.direction * s.gradient).sum(axis=1)

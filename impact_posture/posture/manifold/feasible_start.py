@@ -56,7 +56,6 @@ class Projector:
         return self.chart.to_q(self._clipped(q))
 
     def _clipped(self, q: Array) -> Array:
-        """Return the chart coordinates of ``q`` clamped to the joint limits, shape (nx,)."""
         return np.minimum(np.maximum(self.chart.to_x(q), self.problem.lower), self.problem.upper)
 
     def residual(self, q: Array) -> tuple[Array, Array]:

@@ -171,7 +171,6 @@ def _embedded(manifold: ConstraintManifold, x: Array, basis: Array) -> Array:
 
 
 def _curve(manifold: ConstraintManifold, x: Array) -> Component:
-    """Follow the curve through a posture in both directions."""
     tangent = manifold.tangents(x[None], 1)[0, 0]
     nodes, lengths, end = _branch(manifold, x, tangent)
     ends = [end]

@@ -174,7 +174,6 @@ class PostureNLP:
 
     @cached_property
     def _warm_solver(self) -> ca.Function:
-        """The solver that continues from given unknowns and multipliers."""
         names = {"grad_f": "nlp_grad_f", "jac_g": "nlp_jac_g", "hess_lag": "nlp_hess_l"}
         known = {option: self.solver.get_function(name) for option, name in names.items()}
         options = _options(self.problem) | WARM_OPTIONS | known

@@ -130,7 +130,6 @@ class ProgramRows:
         return Derivatives(multipliers[new_rows], J[new_rows, new_columns], H[new_columns, new_columns])
 
     def _of_sides(self, piece: LiftedRows) -> Derivatives:
-        """Return the cached derivatives of :attr:`LiftedRows.sides` of the piece ``piece``."""
         if piece not in self._sides:
             self._sides[piece] = Derivatives.of(piece.sides, piece.variables)
         return self._sides[piece]

@@ -172,7 +172,6 @@ def search_globally(
 
 
 def _compared(before: PostureSolution, after: PostureSolution) -> tuple[float, float, float, float, int]:
-    """Return improvement, missed rate and the estimates of :class:`GlobalSearch`."""
     value, estimate = before.problem.objective.value, before.estimate
     best, starts = value(after.q), sum(optimum.hits for optimum in before.optima)
     near = sum(optimum.hits for optimum in before.optima if optimum.objective <= best * (1 + _MISSED))

@@ -201,7 +201,6 @@ class GrowingSearch:
         return int(self.nlp.solver.size1_in("x0"))
 
     def _next(self, waiting: list[int], runs: dict[int, SolverRun]) -> list[int]:
-        """Return the indices of the starts to run next, in increasing order."""
         if not runs and self.problem.grows:
             # Run the first starts alone, because most other starts need the same additional rows.
             return waiting[:FIRST]
@@ -215,7 +214,6 @@ class GrowingSearch:
         return sorted(k for group in list(groups.values())[:count] for k in group)
 
     def _clear(self, run: SolverRun) -> bool:
-        """Return whether no original shapes touch at the final posture of a run."""
         around = self.problem.surroundings
         return around is None or run.record is None or not around.collisions(run.record.q)
 

@@ -151,7 +151,6 @@ def _slowed(least: LeastViolation, seed: int, program: ElasticProgram) -> LeastV
 
 
 def _at_speed(problem: ConstrainedProblem, speed: float) -> ConstrainedProblem:
-    """Return the problem with another approach speed, m/s."""
     constraints = (c.slower(speed) if isinstance(c, ApproachSpeed) else c for c in problem.constraints)
     return replace(problem, constraints=tuple(constraints))
 

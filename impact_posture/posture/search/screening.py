@@ -132,7 +132,6 @@ class _Search:
         self._hops = 0
 
     def begin(self, count: int) -> None:
-        """Begin random descents and hops."""
         if not count:
             return
         x, tag = self._manifold.draw(self._rng, count, self._initial), np.full(count, _RANDOM)
@@ -143,7 +142,6 @@ class _Search:
         self.descent.add(x, tag)
 
     def begin_feasible(self, count: int, seed: int) -> None:
-        """Begin descents from random starts that satisfy all constraints."""
         draws = StartDraws(self._problem, (self._initial,), count + 1, seed)
         starts = [q for k in range(count) if (q := draws.choose(k + 1)) is not None]
         x = np.array([self._manifold.chart.to_x(q) for q in starts]).reshape(-1, self._manifold.chart.nx)
@@ -174,7 +172,6 @@ class _Search:
         return hits >= enough and bool(best.argmax() < (1 - _IDLE) * len(merit))
 
     def result(self) -> Screening:
-        """Choose the guesses for IPOPT, and count the hits of all optima."""
         order = np.argsort(self._merit, kind="stable")
         projector, guesses = Projector(self._problem), dict[int, Array]()
         partial = not all(isinstance(c, ExpressionConstraint) for c in self._problem.constraints)
