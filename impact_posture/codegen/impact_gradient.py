@@ -229,11 +229,19 @@ class ImpactGradient:
             InputError: A shape or a type is wrong.
             SpecError: An earlier version wrote the export, which therefore lacks this function.
         """
-        if "objective" not in self._batches:
-            raise SpecError("has no objective_batch", where=str(self.manifest["prefix"]), hint="run codegen again")
         q = np.ascontiguousarray(q, dtype=self.dtype)
         self.check_shapes(q)
         return self._batch("objective", (q,), out, threads)
+
+    def batch_function(self, name: str) -> Any:
+        """Return the C function for batches of ``eval`` or ``objective``.
+
+        Raises:
+            SpecError: An earlier version wrote the export, which therefore lacks this function.
+        """
+        if name not in self._batches:
+            raise SpecError(f"has no {name}_batch", where=str(self.manifest["prefix"]), hint="run codegen again")
+        return self._batches[name]
 
     def check_shapes(self, q: Array, n: Array | None = None) -> None:
         """Raise ``InputError`` unless ``q`` has shape (N, nq), and ``n`` has shape (3,) or (N, 3)."""
@@ -245,7 +253,7 @@ class ImpactGradient:
     def _batch(
         self, name: str, inputs: tuple[Array, ...], out: tuple[Array, Array] | None, threads: int
     ) -> tuple[Array, Array]:
-        count, call = len(inputs[0]), self._batches[name]
+        count, call = len(inputs[0]), self.batch_function(name)
         value, grad = (np.empty(count, self.dtype), np.empty((count, self.nv), self.dtype)) if out is None else out
         for array, shape in ((value, (count,)), (grad, (count, self.nv))):
             if array.shape != shape or array.dtype != self.dtype or not array.flags.carray:

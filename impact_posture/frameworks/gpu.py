@@ -97,6 +97,8 @@ class BatchMetric:
 
     def _call(self, name: str, q: Any, n: Any, in_q: bool) -> tuple[Any, Any]:
         package, on_gpu = _package(q), _on_gpu(q)
+        # Without quaternions and cosine-sine pairs, both gradients are equal.
+        in_q = in_q and bool(self._joints)
         xp = import_extra("cupy", "cuda", "CuPy") if on_gpu else np
         device = q.__dlpack_device__()[1] if on_gpu else 0
         with xp.cuda.Device(device) if on_gpu else nullcontext():
@@ -104,11 +106,11 @@ class BatchMetric:
             rows = xp.ascontiguousarray(given, dtype=self.gradient.dtype)
             normals = () if n is None else (xp.asarray(_to(xp, n), dtype=self.gradient.dtype),)
             self.gradient.check_shapes(rows, *normals)
-            rows, scales = self._normalized(xp, rows) if in_q else (rows, None)
+            rows, scales = self.normalized(xp, rows) if in_q else (rows, None)
             inputs = (rows, *normals)
             value, grad = self._launch(xp, (name, device), *inputs) if on_gpu else self._on_cores(name, *inputs)
             if in_q:
-                grad = self._in_coordinates(xp, rows, scales, grad)
+                grad = self.in_coordinates(xp, rows, scales, grad)
             kept = given.dtype if given.dtype.kind == "f" else self.gradient.dtype
             results = [array.astype(kept, copy=False) for array in (value, grad)]
             value, grad = results if package is xp else map(package.from_dlpack, results)
@@ -138,37 +140,42 @@ class BatchMetric:
             kernel((-(-count // BLOCK_THREADS),), (BLOCK_THREADS,), (q, *normals, np.int32(count), value, grad, 0))
         return value, grad
 
-    def _normalized(self, xp: Any, q: Any) -> tuple[Any, Any]:
-        """Return ``u(q)``, with normalized quaternions and cosine-sine pairs, and ``u(q)/q``, shape (N, nq)."""
-        scales = xp.ones_like(q)
-        for names, at, _ in self._joints:
-            unit = slice(at + len(names) - (4 if "qw" in names else 2), at + len(names))
-            scales[:, unit] = 1 / xp.linalg.norm(q[:, unit], axis=1)[:, None]
+    def normalized(self, xp: Any, q: Any) -> tuple[Any, Any]:
+        """Return ``u(q)``, with normalized quaternions and cosine-sine pairs, and ``u(q)/q``, shape (N, nq).
+
+        ``xp`` is the module of the array ``q``, such as NumPy.
+        """
+        ones, parts, at = xp.ones_like(q), list[Any](), 0
+        for names, first, _ in self._joints:
+            last = first + len(names)
+            unit = last - (4 if "qw" in names else 2)
+            norm = xp.linalg.norm(q[:, unit:last], axis=1, keepdims=True)
+            parts += [ones[:, at:unit], ones[:, unit:last] / norm]
+            at = last
+        scales = xp.concatenate([*parts, ones[:, at:]], axis=1)
         return q * scales, scales
 
-    def _in_coordinates(self, xp: Any, q: Any, scales: Any, tangent: Any) -> Any:
-        grad = xp.empty_like(q)
-        plain = set(range(self.gradient.nq)), set(range(self.gradient.nv))
+    def in_coordinates(self, xp: Any, q: Any, scales: Any, tangent: Any) -> Any:
+        """Return the gradients of ``H(u(q))``, shape (N, nq), from tangent gradients and ``u(q)``."""
+        parts, done = list[Any](), 0
         for names, at, speed in self._joints:
             last, size = at + len(names), _JOINTS[names]
-            plain[0].difference_update(range(at, last))
-            plain[1].difference_update(range(speed, speed + size))
-            g = tangent[:, speed : speed + size]
+            # Joints before this joint have as many entries in q as in ν.
+            parts.append(tangent[:, done:speed])
+            done = speed + size
+            g = tangent[:, speed:done]
             if "qw" in names:
                 # With the vector part r and the scalar part w, q̇ = ½(wω + r×ω, −rᵀω) and R v = v + 2 r×(wv + r×v).
                 r, w, turn = q[:, last - 4 : last - 1], q[:, last - 1 : last], g[:, -3:]
-                grad[:, last - 4 : last - 1] = 2 * (w * turn + xp.cross(r, turn))
-                grad[:, last - 1] = -2 * (r * turn).sum(axis=1)
                 if size == 6:
-                    grad[:, at : at + 3] = g[:, :3] + 2 * xp.cross(r, w * g[:, :3] + xp.cross(r, g[:, :3]))
-                continue
-            c, s = q[:, last - 2], q[:, last - 1]
-            grad[:, last - 2], grad[:, last - 1] = -s * g[:, -1], c * g[:, -1]
-            if size == 3:
-                grad[:, at], grad[:, at + 1] = c * g[:, 0] - s * g[:, 1], s * g[:, 0] + c * g[:, 1]
-        to, source = (xp.asarray(sorted(entries), dtype=int) for entries in plain)
-        grad[:, to] = tangent[:, source]
-        return grad * scales
+                    parts.append(g[:, :3] + 2 * xp.cross(r, w * g[:, :3] + xp.cross(r, g[:, :3])))
+                parts += [2 * (w * turn + xp.cross(r, turn)), -2 * (r * turn).sum(axis=1, keepdims=True)]
+            else:
+                c, s, x, y, turn = q[:, last - 2 : last - 1], q[:, last - 1 : last], g[:, :1], g[:, 1:2], g[:, -1:]
+                if size == 3:
+                    parts += [c * x - s * y, s * x + c * y]
+                parts += [-s * turn, c * turn]
+        return xp.concatenate([*parts, tangent[:, done:]], axis=1) * scales
 
 
 def _joints(q_names: Sequence[str]) -> Iterator[tuple[tuple[str, ...], int, int]]:

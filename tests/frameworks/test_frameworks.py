@@ -218,28 +218,66 @@ def test_torch_differentiates(sample: Sample) -> None:
 # ---- JAX ----------------------------------------------------------------------------------------------------------
 
 
+def jax_module() -> Any:
+    return pytest.importorskip("jax", reason="needs JAX: pip install jax", exc_type=ImportError)
+
+
+def near(values: Any, expected: Any, digits: float = 1e-13) -> None:
+    np.testing.assert_allclose(values, expected, rtol=0, atol=digits * np.abs(expected).max())
+
+
 def test_jax_transforms(sample: Sample) -> None:
-    jax = pytest.importorskip("jax", reason="needs JAX: pip install jax", exc_type=ImportError)
+    jax = jax_module()
     metric = ip.jax.load(sample.out)
     with jax.enable_x64(True):
-        q, n = jax.numpy.asarray(sample.q[:4]), jax.numpy.asarray(N)
-        H, grad = metric.batch.value_and_gradient(sample.q[:4], N, in_q=True)
-        np.testing.assert_array_equal(metric(q, n), H)
-        np.testing.assert_array_equal(jax.jit(jax.vmap(metric, (0, None)))(q, n), H)
-        np.testing.assert_array_equal(jax.vmap(jax.jit(jax.grad(metric)), (0, None))(q, n), grad)
+        # Enough rows for several threads.
+        q, n = jax.numpy.asarray(sample.q), jax.numpy.asarray(N)
+        H, grad = metric.batch.value_and_gradient(sample.q, N, in_q=True)
+        near(metric(q, n), H)
+        near(jax.jit(jax.vmap(metric, (0, None)))(q, n), H)
+        near(jax.jit(jax.vmap(jax.grad(metric), (0, None)))(q, n), grad)
+        near(jax.vmap(jax.jit(jax.vmap(metric)))(q.reshape(20, 30, -1), np.tile(N, (20, 30, 1))).ravel(), H)
         change = jax.numpy.ones_like(q)
         _, along = jax.jvp(lambda at: metric(at, n), (q,), (change,))
-        np.testing.assert_allclose(along, grad.sum(axis=1), rtol=1e-12)
-        mass, slope = metric.batch.objective(sample.q[:4], in_q=True)
+        near(along, grad.sum(axis=1))
+        mass, slope = metric.batch.objective(sample.q, in_q=True)
         value, back = jax.jit(jax.vmap(jax.value_and_grad(metric.objective)))(q)
-        np.testing.assert_array_equal(value, mass)
-        np.testing.assert_array_equal(back, slope)
+        near(value, mass)
+        near(back, slope)
+        assert metric(q[:0], n).shape == (0,)
+        assert np.isnan(metric(q.at[300, 0].set(np.nan), n)).nonzero()[0].tolist() == [300]
         ours, _ = metric.batch.objective(q)
         assert isinstance(ours, jax.Array)
         with pytest.raises(InputError, match="derivative with respect to n"):
             jax.grad(metric, argnums=1)(q[0], n)
-    assert metric(np.float32(sample.q[:2]), N).dtype == np.float32
+    half = metric(np.float32(sample.q), N)
+    assert half.dtype == np.float32
+    near(half, H, 1e-5)
     for whole in (WHOLE, jax.numpy.asarray(WHOLE, dtype=jax.numpy.bfloat16)):
         assert float(metric(whole, N)[0]) == pytest.approx(of_oracle(sample, np.array(WHOLE[0], float)), rel=0.01)
     with pytest.raises(InputError, match="give shape"):
         metric(sample.q[:, 1:], N)
+
+
+def test_jax_copies_arrays_of_a_gpu(sample: Sample, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Call the functions for other devices, which compute the same numbers on the CPU."""
+    jax = jax_module()
+    metric = ip.jax.load(sample.out)
+    H, grad = metric.batch.value_and_gradient(sample.q, N, in_q=True)
+    monkeypatch.setattr(metric, "_foreign_call", metric._callback)
+    with jax.enable_x64(True):
+        value, back = jax.jit(jax.vmap(jax.value_and_grad(metric), (0, None)))(sample.q, N)
+        near(value, H)
+        near(back, grad)
+
+
+def test_jax_calls_exports_in_float(sample: Sample, tmp_path: Path) -> None:
+    jax = jax_module()
+    write_export([sample.objective], tmp_path, prefix="single", single=True, build=True)
+    metric = ip.jax.load(tmp_path)
+    H, _ = metric.batch.value_and_gradient(sample.q, N)
+    with jax.enable_x64(True):
+        value = metric(sample.q, N)
+        assert value.dtype == float
+        near(value, H, 1e-5)
+    near(metric(np.float32(sample.q), N), H, 1e-5)
