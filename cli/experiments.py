@@ -20,7 +20,8 @@ ScenarioName = Annotated[
     typer.Argument(
         metavar="SCENARIO",
         help="aerial-vertical, aerial-lateral, solo8-push, talos-push, talos-throw, solo8-throw, talos-strike, "
-        "g1-strike, solo12-landing, solo12-drop, panda-tap, ur5-strike, hextilt-poke, or a path to a scenario.toml.",
+        "g1-strike, solo12-landing, solo12-drop, panda-tap, panda-wall, ur5-strike, hextilt-poke, or a path to a "
+        "scenario.toml.",
     ),
 ]
 Seeds = Annotated[int, option("--seeds", RUN, "Number of seeds per controller, counted from 0.", min=1)]

@@ -12,7 +12,7 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 import argparse
 import sys
 
-from docs.studies.core import STUDIES, Request, Study, page_of
+from docs.studies.core import STUDIES, Request, Study, page_of, renewed
 from impact_posture.errors import ImpactPostureError
 from impact_posture.posture.program.ipopt import one_blas_thread
 
@@ -36,8 +36,10 @@ def main() -> int:
     parser.add_argument("--write", action="store_true", help="also write the page in docs/generated")
     asked = parser.parse_args()
     wanted = [STUDIES[name] for name in asked.names]
-    if asked.write and (asked.only or asked.number is not None or not all(study.page for study in wanted)):
-        parser.error("--write is for studies that have a page, and for all of their cases: leave out --only")
+    if asked.write and (asked.number is not None or not all(study.page for study in wanted)):
+        parser.error("--write is for studies that have a page")
+    if asked.write and asked.only and not all(study.parts for study in wanted):
+        parser.error("--write is for all cases of this study: leave out --only")
     if asked.count is not None and asked.count < 1:
         parser.error("--count: one or more")
     return max([_run(study, asked) for study in wanted])
@@ -57,7 +59,8 @@ def _run(study: Study, asked: argparse.Namespace) -> int:
         print(error, file=sys.stderr)
         return 1
     if asked.write:
-        page_of(study.name).write_text("\n".join([*lines, ""]), encoding="utf-8")
+        page, text = page_of(study.name), "\n".join([*lines, ""])
+        page.write_text(renewed(page.read_text(encoding="utf-8"), text) if asked.only else text, encoding="utf-8")
     for word in request.missed:
         print(f"missed: {word}", file=sys.stderr)
     return int(bool(request.missed))

@@ -46,6 +46,7 @@ class Study:
     count: int = 1
     page: bool = True
     target: str = ""  # target of make that writes the page
+    parts: bool = False  # whether the page has a section ### for each case, so that some cases can be renewed
 
     def lines(self, request: Request) -> Iterator[str]:
         """Run the study and yield its results as lines of text."""
@@ -83,8 +84,8 @@ STUDIES = {
         Study("search", "search_quality:arms", "the default search and 16 starts; seeds", 3, target="study-global"),
         Study("search-catalogue", "search_quality:catalogue", "default search, catalogue; seeds", 3, page=False),
         Study("flow", "flow", "where the reference flow rests, from random starts", 1000, target="study-flow"),
-        Study("strikes", "strikes", "planned strikes, other controllers; seeds", 10, target="study-strikes"),
-        Study("landing", "strikes:landing", "a fall onto four feet; seeds", 10, target="study-strikes"),
+        Study("strikes", "strikes", "planned strikes; seeds", 10, target="study-strikes", parts=True),
+        Study("landing", "strikes:landing", "a fall onto four feet; seeds", 10, target="study-strikes", parts=True),
         Study("strike-instants", "strikes:instants", "early and late contacts of strikes", target="study-strikes"),
         Study("real-impacts", "real_impacts", "predicted balls, strikes and taps", target="study-real-impacts"),
         Study("points", "robustness.study:points", "runs for robustness, envelope; random draws", 40, page=False),
@@ -121,6 +122,18 @@ class Request:
 
 def page_of(name: str) -> Path:
     return ROOT / "docs" / "generated" / f"{name}.md"
+
+
+def renewed(page: str, text: str) -> str:
+    """Return a page with its sections ``### …`` replaced or followed by the sections of another text.
+
+    Raise ``ValueError`` if the text above the sections differs, for example because of another number of seeds.
+    """
+    (above, *old), (intro, *new) = (("\n" + part).strip("\n").split("\n### ") for part in (page, text))
+    if above.rstrip() != intro.rstrip():
+        raise ValueError("the text above the sections differs from the page: renew all cases")
+    sections = {section.splitlines()[0]: section.rstrip() for section in (*old, *new)}
+    return "\n\n### ".join([above.rstrip(), *sections.values()]) + "\n"
 
 
 def say(words: str, end: str = "\n") -> None:

@@ -35,7 +35,8 @@ from impact_posture.system.arrays import Array
 
 # A number after a name replaces the approach speed of the scenario, m/s.
 CASES = (
-    "ur5-strike", "panda-tap", "aerial-vertical", "aerial-lateral", "g1-strike 0.5", "g1-strike", "talos-strike 0.5"
+    "ur5-strike", "panda-tap", "aerial-vertical", "aerial-lateral", "g1-strike 0.5", "g1-strike", "talos-strike 0.5",
+    "talos-strike", "panda-wall",
 )  # fmt: skip
 CONTROLLERS = ("strike", "nominal", "robust-flow")
 # Falls onto several feet, and their controllers.
@@ -124,7 +125,8 @@ def landing(request: Request) -> Iterator[str]:
 
 
 def _tables(request: Request, cases: Sequence[str], controllers: Sequence[str]) -> Iterator[str]:
-    pairs = [(case, name) for case in cases if request.only in case for name in controllers]
+    picked = [request.only] if request.only in cases else [case for case in cases if request.only in case]
+    pairs = [(case, name) for case in picked for name in controllers]
     seeds = range(1, request.count + 1)
     answers = collected(lambda k: results(*pairs[k], seeds), len(pairs), request.jobs, "controllers")
     answer_of = dict(zip(pairs, answers, strict=True))

@@ -87,9 +87,10 @@ def offline_posture(
     - The base of a flying robot stays level.
     - The feet of a standing robot stay in place.  The center of mass is above the feet, and the base tilts at most as
       far as the reference flow allows.
-    - If the robot ``strikes``, only the end effector touches the surface, also if the surface is tilted and shifted
-      as far as ``[spread]`` of the scenario states, or by :data:`SURFACE_SPREAD` if this is more.  No foot of a
-      standing robot lifts or slides during the impact.
+    - If the robot ``strikes``, its joints reach the speed of the contact, increased by the spread of the speed in
+      ``[spread]`` of the scenario, or else the greatest possible speed.  Only the end effector touches the surface,
+      also if the surface is tilted and shifted as far as ``[spread]`` states, or by :data:`SURFACE_SPREAD` if this
+      is more.  No foot of a standing robot lifts or slides during the impact.
     - A robot that falls touches the surface with its feet, which are as far apart as in the start posture.
 
     If no posture satisfies all constraints, these constraints are dropped in this order: tilt and shift of the
@@ -99,15 +100,12 @@ def offline_posture(
         Infeasible, SolverFailed: The same errors as in :func:`impact_posture.posture.search.multistart.solve`.
     """
     tell("looking for the offline posture")
-    wanted, notes = scenario_requirements(setup, objective, at_contact=at_contact), dict[tuple[bool, bool], str]()
+    wanted = scenario_requirements(setup, objective, at_contact=at_contact, strikes=strikes)
+    notes = dict[tuple[bool, bool], str]()
     # A robot that does not stand has no support polygon, so the second margin is zero.
     margins = dict.fromkeys((stops, edges if wanted.com_over_feet else 0.0) for stops, edges in _MARGINS)
     if setup.scenario.falls:
         margins = {(_LANDING_MARGIN, 0.0): None, **margins}
-    if strikes:
-        tilt, shift = SURFACE_SPREAD
-        spread = max(tilt, setup.scenario.spread.normal), max(shift, setup.scenario.spread.gap)
-        wanted = replace(wanted, strike=True, surface_spread=spread)
     kept = strikes and bool(objective.supports)
     levels = dict.fromkeys(((kept, True), (False, True), (False, False)))
     attempts = [(*level, *margin) for level in levels for margin in margins]
@@ -136,7 +134,9 @@ def offline_posture(
     raise AssertionError("the last attempt returns or raises")
 
 
-def scenario_requirements(setup: Setup, objective: WorstCaseObjective, *, at_contact: bool = True) -> Requirements:
+def scenario_requirements(
+    setup: Setup, objective: WorstCaseObjective, *, at_contact: bool = True, strikes: bool = False
+) -> Requirements:
     """Return the requirements of a scenario without margins, for the arguments of :func:`offline_posture`."""
     control, contact, base, target = setup.scenario.control, objective.contact, "free", None
     if setup.robot.floating:
@@ -156,6 +156,11 @@ def scenario_requirements(setup: Setup, objective: WorstCaseObjective, *, at_con
         regularization=_NEARNESS,
         friction=FRICTION if control.footing is None else control.footing.friction,
     )
+    if strikes and setup.scenario.contacts is not None:
+        (tilt, shift), spread = SURFACE_SPREAD, setup.scenario.spread
+        speed = (1 + spread.speed) * setup.scenario.contacts.speed
+        larger = max(tilt, spread.normal), max(shift, spread.gap)
+        settings = replace(settings, strike=True, speed=speed, surface_spread=larger)
     demands = requirements(settings, objective)
     return replace(demands, com_over_feet=bool(objective.supports), com_asked=False, limit_share=SHARE)
 

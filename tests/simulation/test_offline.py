@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pinocchio as pin
 import pytest
+from scipy.optimize import linprog
 
 from docs.studies.robustness.outcomes import is_held
 from impact_posture.errors import Infeasible
@@ -19,7 +20,7 @@ from impact_posture.posture.search.growing_search import feasible
 from impact_posture.robot.actuation import allocation_matrix, thrust_limits
 from impact_posture.simulation import offline_posture as offline
 from impact_posture.simulation.offline_posture import SHARE, offline_posture, scenario_requirements
-from impact_posture.simulation.scenario_file import read_scenario
+from impact_posture.simulation.scenario_file import Spread, read_scenario
 from impact_posture.simulation.scenario_objective import scenario_objective
 from impact_posture.simulation.setup import set_up
 from impact_posture.tsid.flow.flow_direction import FlowOptions
@@ -37,6 +38,24 @@ def test_the_posture_satisfies_the_constraints_of_optimize(name: str) -> None:
     assert feasible(problem, posture.q)
     assert posture.note == "" and posture.objective < posture.initial and posture.distance > 0.1
     assert posture.objective == pytest.approx(objective.value(posture.q))
+
+
+def test_the_posture_of_a_strike_reaches_its_speed_within_the_velocity_limits() -> None:
+    """The oracle is the least largest share of a velocity limit with ``J q̇ = −v n`` and no tilt, by SciPy."""
+    setup = set_up(replace(read_scenario("panda-wall"), spread=Spread(speed=0.1)))
+    objective, model = scenario_objective(setup, "sticking"), setup.robot.model
+    posture = offline_posture(setup, objective, strikes=True)
+    frame, data = model.getFrameId("panda_hand_tcp"), model.createData()
+    pin.framesForwardKinematics(model, data, posture.q)
+    J = pin.computeFrameJacobian(model, data, posture.q, frame, pin.LOCAL_WORLD_ALIGNED)
+    J[:3] -= pin.skew(data.oMf[frame].rotation @ np.array(objective.contact.offset)) @ J[3:]
+    limits, moving = setup.robot.velocity_limits[:7], slice(0, 7)
+    A = np.column_stack([J[[0, 1, 2, 4, 5], moving], np.zeros(5)])
+    sides = np.vstack([np.column_stack([sign * np.diag(1 / limits), -np.ones(7)]) for sign in (1, -1)])
+    bounds = [(None, None)] * 7 + [(0, None)]
+    best = linprog(np.eye(8)[-1], sides, np.zeros(14), A, [1.1 * 0.5, 0, 0, 0, 0], bounds)
+    assert best.status == 0 and best.fun <= 1
+    assert scenario_requirements(setup, objective).approach_speed == 0
 
 
 @pytest.mark.parametrize("name", ["aerial-vertical", "aerial-lateral"])

@@ -42,8 +42,8 @@ DOCS = Path(__file__).parents[2] / "docs"
 ARM = DOCS / "examples" / "rail_arm"
 SHIPPED = ("aerial-lateral", "aerial-vertical", "solo8-push", "talos-push")
 REAL = (
-    "g1-strike", "hextilt-poke", "panda-tap", "solo12-drop", "solo12-landing", "solo8-throw", "talos-strike",
-    "talos-throw", "ur5-strike"
+    "g1-strike", "hextilt-poke", "panda-tap", "panda-wall", "solo12-drop", "solo12-landing", "solo8-throw",
+    "talos-strike", "talos-throw", "ur5-strike",
 )  # fmt: skip
 
 

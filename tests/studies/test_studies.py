@@ -17,7 +17,7 @@ from docs.studies import strikes
 from docs.studies.__main__ import main
 from docs.studies.build import build
 from docs.studies.cases import CASES
-from docs.studies.core import ROOT, STUDIES, Request, page_of
+from docs.studies.core import ROOT, STUDIES, Request, page_of, renewed
 from docs.studies.exported import _FEET, _LOADED
 from docs.studies.kernel import peers, pinocchio
 from docs.studies.kernel.counts import of_export, of_function, total
@@ -222,6 +222,16 @@ def test_the_program_prints_and_refuses(monkeypatch: pytest.MonkeyPatch, capsys:
         with pytest.raises(SystemExit) as stopped:
             main()
         assert stopped.value.code == 2
+
+
+def test_a_page_keeps_the_sections_that_a_study_does_not_renew() -> None:
+    page, part = "intro\n\n### a\n\n1\n\n### b\n\n2\n", "intro\n\n### c, 1 m/s\n\n4\n\n### a\n\n3\n"
+    assert renewed(page, part) == "intro\n\n### a\n\n3\n\n### b\n\n2\n\n### c, 1 m/s\n\n4\n"
+    assert renewed(page, page) == page
+    with pytest.raises(ValueError, match="renew all"):
+        renewed(page, "another" + part)
+    shown = page_of("strikes").read_text(encoding="utf-8")
+    assert renewed(shown, shown) == shown
 
 
 def test_the_page_of_the_kernel_has_its_rows(monkeypatch: pytest.MonkeyPatch) -> None:
