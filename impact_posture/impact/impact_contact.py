@@ -15,7 +15,7 @@ from impact_posture.errors import ContactError
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_spec import Support as Support
 
-# A normal counts as a unit vector if its length differs from 1 by at most this value.
+# A normal is treated as a unit vector if its length differs from 1 by at most this value.
 _UNIT = 1e-15
 # Largest allowed impulse (N·s) and speed (m/s).  The square of a larger value, multiplied by H or V, could overflow.
 LARGEST = 1e100

@@ -230,7 +230,7 @@ def _numbers(value: object, key: str, where: str) -> list[float]:
 
 
 def _number(value: object, key: str, where: str) -> float:
-    # Numbers from YAML are text.  Infinity and NaN are .inf and .nan in YAML.
+    # Numbers in YAML files are read as text.  Infinity and NaN are .inf and .nan in YAML.
     if isinstance(value, (int, float, str)) and not isinstance(value, bool):
         with suppress(ValueError, OverflowError):
             return float(re.sub(r"\.(?=(inf|nan)$)", "", value, flags=re.I) if isinstance(value, str) else value)

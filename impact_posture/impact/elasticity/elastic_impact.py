@@ -193,7 +193,7 @@ class ElasticImpact:
     def compliance(self, q: Array) -> float:
         """Return the compliance ``C`` of the springs at the contact point at ``q``, m/N.
 
-        For this compliance, rotors and feet are fixed.  If the robot has no supports, the base is fixed too.
+        Rotors and feet are treated as fixed.  If the robot has no supports, the base is also treated as fixed.
         """
         oracle = self.oracle.at(q)
         feet = oracle.Js

@@ -45,7 +45,7 @@ class StandingImpact(JsonBlock):
 
     @property
     def line(self) -> str:
-        """Effect of the impact on the feet, in words."""
+        """Description of the effect of the impact on the feet."""
         counted = f" with the weight over the {milliseconds(self.time)} of the contact" if self.time > 0 else ""
         moved = (("lifts or tips", self.lifts), ("slides", self.slides))
         does = [f"{verb} {', '.join(frames)}" for verb, frames in moved if frames]

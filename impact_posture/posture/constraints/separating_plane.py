@@ -166,7 +166,7 @@ class SeparatingPlane:
         """Return the equations, the unknowns ``n, c, m, d, s`` (``m, d, s`` for a half-space), and the slack.
 
         The unknown ``s`` is in units of 2 cm.  ``label`` is the suffix of the names of the unknowns.  ``known``
-        contains ``n, c`` of a half-space, shape (4, 1); it is not used for a swept hull.
+        contains ``n, c`` of a half-space, shape (4, 1), and is not used for a swept hull.
         """
         plane = ca.SX(0, 1) if self.known else ca.SX.sym(f"plane{label}", 4)
         m, d, s = ca.SX.sym(f"m{label}", 3), ca.SX.sym(f"d{label}"), ca.SX.sym(f"s{label}")

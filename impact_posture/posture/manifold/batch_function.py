@@ -25,7 +25,8 @@ from impact_posture.system.toolchain import require_compiler, run_compiler
 
 # Number of postures that NumPy evaluates together.  With fewer postures, the calls of NumPy take most of the time.
 _WIDTH = 512
-# Number of postures in a block of the loop in C.  With fewer postures, selecting the code takes most of the time.
+# Number of postures in a block of the loop in C.  In a smaller block, branching to the code of each operation would
+# take most of the time.
 _LANES = 64
 # Below this number of postures, CasADi is faster.
 _SMALL = 64

@@ -170,7 +170,7 @@ def _near_bounds(rows: Linearization) -> list[_NearBound]:
 def _active(near: Sequence[_NearBound], multipliers: Array) -> tuple[Active, ...]:
     """Return the inequalities with a multiplier; multipliers of rows with equal names are summed up.
 
-    Rows without a name are part of a named row and are left out.
+    Rows without a name are left out, because they only complete a named row of the same constraint.
     """
     sums: dict[tuple[str, str], float] = {}
     for bound, multiplier in zip(near, multipliers, strict=True):

@@ -136,7 +136,7 @@ class ElasticProgram:
         self._fixed = Derivatives.of(ca.vertcat(self._away, rows.norms), rows.x)
 
     def solver(self, problem: ConstrainedProblem) -> ca.Function:
-        """Return ``nlpsol`` for the problem of the constructor, also with another target or additional rows."""
+        """Return ``nlpsol`` for the original problem, or for this problem with another target or more rows."""
         self.problem, structure = problem, problem.structure
         if self._latest is None or self._latest[0] != structure:
             self._latest = structure, self._solver(problem)
