@@ -4,12 +4,13 @@ VENV := .venv
 BIN := $(VENV)/bin
 JOBS ?= 2
 
-.PHONY: help demo test coverage wheel test-wheel lowest lint types docs bench bench-gpu study-impacts study-elastic study-hits study-global study-feasible study-flow study-robustness study-strikes study-real-impacts study-verdict study-robots study-scan study-controller study-sweep study-hostile reproduction calibration regression
+.PHONY: help demo test test-long coverage wheel test-wheel lowest lint types docs bench bench-gpu study-impacts study-elastic study-hits study-global study-feasible study-flow study-robustness study-strikes study-real-impacts study-verdict study-robots study-scan study-controller study-sweep study-hostile reproduction calibration regression
 .PHONY: pictures viewer clean
 
 help:
 	@echo "make demo        install into .venv, optimize a posture of a real robot, write pictures and C code into demo/"
-	@echo "make test        install with the test extras and run all tests"
+	@echo "make test        install with the test extras and run the tests"
+	@echo "make test-long   all tests, also parameters that repeat a check with another robot, objective or controller"
 	@echo "make lint types  check the code with ruff and import-linter; check the types with mypy"
 	@echo "make docs        build the documentation site in docs/_build/html"
 	@echo "make wheel       build sdist and wheel, compare their files with git, install the wheel, run every command, check types"
@@ -71,6 +72,10 @@ test: $(VENV)/.installed-test
 	$(BIN)/python -m compileall -q impact_posture cli robots
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -q
 
+test-long: $(VENV)/.installed-test
+	$(BIN)/python -m compileall -q impact_posture cli robots
+	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -q --long
+
 wheel: $(VENV)/.installed-test
 	$(BIN)/python -m tests.support.installed_wheel
 
@@ -103,7 +108,7 @@ bench-gpu: $(VENV)/.installed-test
 	$(BIN)/python -m docs.studies gpu
 
 coverage: $(VENV)/.installed-test
-	$(BIN)/python -m tests.support.coverage_report -n $(JOBS) --dist worksteal
+	$(BIN)/python -m tests.support.coverage_report -n $(JOBS) --dist worksteal --long
 
 study-impacts: $(VENV)/.installed-test
 	$(BIN)/python -m docs.studies impacts --write

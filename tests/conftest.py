@@ -46,13 +46,39 @@ settings.load_profile("impact-posture")
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--rounding", type=int, metavar="SEED", help="linear algebra as another processor may round it")
     parser.addoption("--hostile-full", action="store_true", help="attack at length: minutes instead of seconds")
+    parser.addoption("--long", action="store_true", help="also run the tests and parameters that are marked as long")
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_configure(config: pytest.Config) -> None:
+    text = "long(but=()): needs --long, except for parameters whose ids are in but"
+    config.addinivalue_line("markers", text)
+
+
+def _deselect_long_tests(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Deselect tests that need ``--long``.  Refuse ids in ``but`` that no parameter has, because it would not run."""
+    short, long = list[pytest.Item](), list[pytest.Item]()
+    unused: dict[str, set[str]] = {}
+    for item in items:
+        mark = item.get_closest_marker("long")
+        ids = unused.setdefault(item.nodeid.partition("[")[0], set(mark.kwargs.get("but", ())) if mark else set())
+        of_item = item.callspec.id if isinstance(item, pytest.Function) and hasattr(item, "callspec") else ""
+        needed = mark is not None and of_item not in mark.kwargs.get("but", ())
+        (long if needed else short).append(item)
+        ids.discard(of_item)
+    wrong = [f"{name}: {sorted(ids)}" for name, ids in unused.items() if ids]
+    if wrong and not any("::" in argument for argument in config.args):
+        raise pytest.UsageError("no parameter has an id in the mark `long`: " + "; ".join(wrong))
+    if not (config.getoption("--long") or config.getoption("--hostile-full")):
+        config.hook.pytest_deselected(items=long)
+        items[:] = short
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Let each worker begin with tests that fork, because a fork takes longer when a process uses more memory.
 
     At the start, ``--dist worksteal`` gives each worker an equal part of the list, without gaps.
     """
+    _deselect_long_tests(config, items)
     parts = [item for item in items if _forks(item)], [item for item in items if not _forks(item)]
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
     items[:] = [

@@ -139,6 +139,7 @@ def test_frames_must_differ_in_the_contact_alone(two: tuple[WorstCaseObjective, 
 STACK_FLAGS = ("-O0", "-O3 -march=native", "-O3 -mavx2 -mfma", "-O3 -mavx512f -mfma", "-O0 -mavx512f")
 
 
+@pytest.mark.long(but=("double-gcc", "float-clang"))
 @pytest.mark.parametrize("tool", ["gcc", "clang"])
 @pytest.mark.parametrize("real", [DOUBLE, FLOAT], ids=lambda r: r.name)
 def test_stack_stays_below_its_bound(arm: WorstCaseObjective, tmp_path: Path, real: Real, tool: str) -> None:
@@ -152,6 +153,7 @@ def test_stack_stays_below_its_bound(arm: WorstCaseObjective, tmp_path: Path, re
             assert deepest <= bound, flags
 
 
+@pytest.mark.long(but=("gcc",))
 @pytest.mark.parametrize("tool", ["gcc", "clang"])
 def test_stack_of_a_robot_that_stands(tmp_path: Path, tool: str) -> None:
     need(tool)

@@ -112,6 +112,7 @@ CASES: dict[str, tuple[str, tuple[str, ...], dict[str, Any], Real]] = {
 }
 
 
+@pytest.mark.long(but=("impulse, two frames", "speed in float", "coulomb with feet", "cone", "sticking"))
 @pytest.mark.parametrize("case", list(CASES))
 def test_equals_the_c_export(case: str, tmp_path: Path) -> None:
     need_compiler()

@@ -63,6 +63,7 @@ def both(name: str, path: tuple[float, ...] = ()) -> tuple[Controller, Reference
     return python, posture, c
 
 
+@pytest.mark.long(but=("talos-path4-options4-300", "tilthex_arm-path0-options0-600", "solo8-path2-options2-600"))
 @pytest.mark.parametrize(
     ("name", "path", "options", "ticks"),
     [

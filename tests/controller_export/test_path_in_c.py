@@ -109,6 +109,7 @@ def start(path: PathReference | PathInC) -> None:
 BEGIN = {0: PathPhase.APPROACH, 250: PathPhase.RUN_UP}
 
 
+@pytest.mark.long(but=("solo8",))
 @pytest.mark.parametrize("name", ["panda", "solo8"])
 def test_a_felt_contact_begins_the_stop(name: str) -> None:
     after = PathPhase.FOLLOW_THROUGH, PathPhase.HOLD

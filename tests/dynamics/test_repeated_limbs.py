@@ -166,6 +166,7 @@ def longest(graph: Graph) -> int:
     return max(depth[k] for nodes in graph.outputs.values() for k in nodes)
 
 
+@pytest.mark.long(but=("romeo-r_ankle-2-0.75", "panda-panda_hand_tcp-1-1.01", "solo8-base_link-4-0.45"))
 @pytest.mark.parametrize(
     ("name", "frame", "width", "most"),
     [
@@ -224,6 +225,7 @@ def test_limbs_are_outermost_and_disjoint() -> None:
 
 
 # Five equal limbs are compiled to one vector of four lanes and one single limb.
+@pytest.mark.long(but=("2",))
 @pytest.mark.parametrize("count", [2, 5])
 def test_compiled_limbs(tmp_path: Path, count: int) -> None:
     need_compiler()

@@ -66,6 +66,7 @@ def test_wrong_clocks(clock: str, arena: Path, hostile_full: bool) -> None:
             judge(f"{argv[:2]}: {outcome.err[-300:]!a}", complaints)
 
 
+@pytest.mark.long(but=("-31536000", "8589934592"))
 @pytest.mark.parametrize("seconds", FILES)
 def test_files_from_the_past_and_the_future(seconds: int, result: Path, arena: Path) -> None:
     shutil.copytree(result, arena / "out")

@@ -177,6 +177,7 @@ def test_unknown_values_are_none() -> None:
 # ---- bounds in a search -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.long(but=("panda-more1",))
 @pytest.mark.parametrize(
     ("name", "more"),
     [("tilthex_arm", {}), ("panda", {"contact_pose": "aligned:25"})],

@@ -160,6 +160,18 @@ def test_lifted_form(name: str) -> None:
                 assert np.linalg.matrix_rank(np.array(system(at, contact.normal, guess)), tol=1e-12) == guess.size
 
 
+@pytest.mark.long(
+    but=(
+        "solo8-sticking",
+        "solo8-coulomb",
+        "solo8-impulse",
+        "panda-effective-mass",
+        "panda-speed",
+        "tilthex_arm-energy",
+        "tilthex_arm-sticking",
+        "tilthex_arm-coulomb",
+    )
+)
 @pytest.mark.parametrize("kind", (*KINDS, "coulomb", "effective-mass"))
 @pytest.mark.parametrize("name", WHOLE)
 def test_objective_functions_agree_with_its_own_numbers(name: str, kind: ObjectiveKind) -> None:

@@ -184,6 +184,7 @@ def test_ties_are_flagged() -> None:
 # ---- gradients ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long(but=("tilthex_arm-impulse", "panda-energy", "solo8-sticking"))
 @pytest.mark.parametrize("kind", CONE_KINDS)
 @pytest.mark.parametrize("name", ["tilthex_arm", "panda", "solo8"])
 def test_gradient_where_the_worst_normal_is_unique(name: str, kind: ObjectiveKind) -> None:
@@ -240,6 +241,7 @@ LINK = """<link name="{0}"><inertial><origin xyz="0.03 0.02 0.2"/><mass value="{
  <inertia ixx="0.02" iyy="0.03" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
 
 
+@pytest.mark.long(but=("45.0",))
 @pytest.mark.parametrize("degrees", [5.0, 45.0])
 def test_solution_equals_brute_force(degrees: float, tmp_path: Path) -> None:
     """Search without duals and gradients: 3,000 sampled normals and Nelder–Mead from many starts."""
@@ -276,6 +278,7 @@ def test_solution_equals_brute_force(degrees: float, tmp_path: Path) -> None:
     assert min(ends) >= mine * (1 - 2e-4), "brute force is better only by the width of its grid"
 
 
+@pytest.mark.long(but=("tilthex_arm-impulse", "panda-sticking", "tilthex_arm-energy"))
 @pytest.mark.parametrize("kind", CONE_KINDS)
 @pytest.mark.parametrize("name", ["tilthex_arm", "panda"])
 def test_starts_certify(name: str, kind: ObjectiveKind) -> None:

@@ -131,6 +131,15 @@ def test_the_oracle_solves_what_it_is_given(
     assert size(distance(result.jump, x.jump)) <= 1e-9 * size(x.jump)
 
 
+@pytest.mark.long(
+    but=(
+        "solo8-straight-None",
+        "solo8-equal knees-None",
+        "solo8-one knee moved by 1e-6-None",
+        "solo12-random-None",
+        "bolt-random-None",
+    )
+)
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize(("name", "label"), CASES)
 def test_the_oracles_sticking_impact(name: str, label: str, seed: int | None) -> None:

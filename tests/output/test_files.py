@@ -56,6 +56,19 @@ def test_the_same_view_gives_the_same_files(pendulum: ResultView, tmp_path: Path
     assert first.read_bytes() == second.read_bytes()
 
 
+@pytest.mark.long(
+    but=(
+        "postures_figure-two_hands",
+        "postures_figure-turned",
+        "jump_figure-talos",
+        "ellipsoid_figure-solo8_cone",
+        "ellipsoid_figure-turned",
+        "classical_figure-pendulum",
+        "self_motion_figure-tilthex",
+        "tradeoff_figure-tilthex",
+        "path_figure-pendulum",
+    )
+)
 @pytest.mark.skipif(
     matplotlib.__version_info__ < (3, 11), reason="before 3.11 matplotlib puts a label here and there on a line"
 )

@@ -319,6 +319,7 @@ def test_bars_carry_means_intervals_and_the_papers_numbers() -> None:
     assert {label.get_text() for label in humanoid.get_yticklabels()} == {"nominal", "robust", "stiff"}
 
 
+@pytest.mark.long(but=("flying-metric_figure", "humanoid-<lambda>1", "pushed-<lambda>"))
 @pytest.mark.parametrize(
     ("name", "figure"),
     [

@@ -110,6 +110,7 @@ def test_limits_hold_at_the_rows_and_between_them(
         assert path.use is not None and path.use.largest["torque"] == pytest.approx(largest, abs=2e-3)
 
 
+@pytest.mark.long(but=("normal0-ur5", "normal1-xarm7"))
 @pytest.mark.parametrize("name", ["ur5", "xarm7"])
 @pytest.mark.parametrize("normal", [(0, 0, 1), (-1, 0, 0)])
 def test_limits_hold_for_the_trajectory_as_a_robot_interpolates_it(

@@ -74,6 +74,7 @@ def contact_of(problem: ConstrainedProblem, q: Array) -> tuple[pin.SE3, Array]:
     return pin.SE3(data.oMf[index].rotation, data.oMf[index].translation + arm), J
 
 
+@pytest.mark.long(but=("solo8", "tilthex_arm", "panda"))
 @pytest.mark.parametrize("name", CASES)
 def test_the_path_arrives_at_the_optimum_with_the_stated_velocity(name: str) -> None:
     solution, path = struck(name)

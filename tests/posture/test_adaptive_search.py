@@ -254,6 +254,7 @@ def test_values_that_are_nearly_equal_are_one() -> None:
     assert hits_by_value([], []) == ()
 
 
+@pytest.mark.long(but=("5",))
 @pytest.mark.parametrize("number", [2, 5])
 def test_the_share_bounds_independent_starts(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """IPOPT from 100 random postures reaches objectives that no descent reached, at most as often as estimated."""

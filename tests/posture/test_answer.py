@@ -84,6 +84,7 @@ def _objective(robot: str, frame: str) -> WorstCaseObjective:
     return problem.impact
 
 
+@pytest.mark.long(but=("tilthex_arm-ee",))
 @pytest.mark.parametrize("robot, frame", [("tilthex_arm", "ee"), ("z1", "link06")])
 def test_code_from_the_cache_is_the_code(
     cache: Path, monkeypatch: pytest.MonkeyPatch, robot: str, frame: str
@@ -182,6 +183,7 @@ def test_an_answer_of_a_small_robot_imports_no_part_of_scipy() -> None:
     assert (done.stdout, done.stderr) == ("[]\n", "")
 
 
+@pytest.mark.long(but=("tiago-normal1",))
 @pytest.mark.parametrize(("robot", "normal"), [("bolt", (0, 0, 1)), ("tiago", (-1, 0, 0))])
 def test_starts_that_share_a_run_end_where_their_own_runs_would(
     robot: str, normal: tuple[float, float, float], monkeypatch: pytest.MonkeyPatch
@@ -204,6 +206,7 @@ def test_starts_that_share_a_run_end_where_their_own_runs_would(
     np.testing.assert_allclose([o.objective for o in together.optima], [o.objective for o in apart.optima], rtol=1e-6)
 
 
+@pytest.mark.long(but=("solo8-normal0-12",))
 @pytest.mark.parametrize("robot, normal, starts", [("solo8", (0.0, 0.0, 1.0), 12), ("tiago", (-1.0, 0.0, 0.0), 24)])
 def test_a_start_that_is_left_would_not_have_been_the_best(
     robot: str, normal: tuple[float, float, float], starts: int, monkeypatch: pytest.MonkeyPatch

@@ -154,6 +154,7 @@ def test_lifted_rows_agree_with_pinocchio_and_with_differences(name: str) -> Non
     check_lifted_rows(constraint, posed.problem.robot.model, posture(posed, 5), z)
 
 
+@pytest.mark.long(but=("tiago-0.8",))
 @pytest.mark.parametrize(("name", "speed"), [("tiago", 0.8), ("talos", 1.0)])
 def test_an_optimum_that_is_too_slow_moves_to_a_fast_one(name: str, speed: float) -> None:
     """Both optima are certified.  Without the constraint on the speed, the optimum is better but too slow."""

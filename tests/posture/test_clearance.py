@@ -438,6 +438,7 @@ def test_starts_lie_near_a_posture_that_is_clear() -> None:
     assert solution.certified_starts == 16
 
 
+@pytest.mark.long(but=("9", "33"))
 @pytest.mark.parametrize("seed", [1, 9, 33])
 def test_the_way_past_a_wall_is_found_from_every_seed(seed: int) -> None:
     # Runs from few of the random postures reach postures without collisions.

@@ -162,6 +162,16 @@ EACH += [(name, name == "bolt", kind) for name in ("panda", "bolt") for kind in 
 EACH += [("bolt", True, "cone")]
 
 
+@pytest.mark.long(
+    but=(
+        "bolt-True-cone",
+        "panda-False-pulling",
+        "tilthex_arm-False-contacts",
+        "tilthex_arm-False-sticking",
+        "tilthex_arm-False-kinetic",
+        "tilthex_arm-False-energy",
+    )
+)
 @pytest.mark.parametrize(("name", "feet", "kind"), EACH)
 def test_the_largest_of_separate_objectives(name: str, feet: bool, kind: str) -> None:
     objective = objective_of(name, MORE[kind], feet=feet)

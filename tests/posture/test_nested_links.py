@@ -96,6 +96,7 @@ def test_a_rod_may_be_in_a_channel_and_not_in_its_walls(
 # ---- robots -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long(but=("icub", "hextilt"))
 @pytest.mark.parametrize("name", ["hextilt", "g1", "icub"])
 def test_nested_bodies_keep_apart_and_most_of_their_free_positions(name: str) -> None:
     """Two joints connect bodies such as pelvis and hip of g1; three joints connect the hip bodies of iCub."""

@@ -53,6 +53,9 @@ def walk(problem: ConstrainedProblem, q: np.ndarray, step: float, count: int) ->
     return line
 
 
+@pytest.mark.long(
+    but=("tilthex_arm-normal0-more0", "tilthex_arm-normal3-more3", "panda-normal5-more5", "xarm7-normal7-more7")
+)
 @pytest.mark.parametrize(
     ("robot", "normal", "more"),
     [
@@ -81,6 +84,17 @@ def test_no_posture_along_the_null_space_is_better(
     assert max(problem.objective.value(q) for q in line) > best * (1 + 1e-6)
 
 
+@pytest.mark.long(
+    but=(
+        "solo8-more0",
+        "talos-more2",
+        "hextilt-more4",
+        "anymal_kinova-more6",
+        "kinova-more7",
+        "g1-more8",
+        "tiago-more9",
+    )
+)
 @pytest.mark.parametrize(
     ("robot", "more"),
     [
@@ -258,6 +272,7 @@ def test_null_space_path_stays_on_the_constraints() -> None:
     assert (np.diff(path.s) > 0).all()
 
 
+@pytest.mark.long(but=("tilthex_arm", "solo8"))
 @pytest.mark.parametrize("robot", ["tilthex_arm", "solo8", "talos"])
 def test_resolved_problem_solves_to_the_same_result(robot: str, tmp_path) -> None:
     settings = make_settings({"robot": robot, "normal": (1, 0, 0), "starts": 3, "armature": {_a_joint(robot): 0.02}})

@@ -144,6 +144,7 @@ def test_three_position_joints_on_a_base_that_flies_are_followed_from_limit_to_l
     np.testing.assert_allclose(np.diff(component.s), steps, rtol=2e-3)
 
 
+@pytest.mark.long(but=("panda-3", "ur5-8"))
 @pytest.mark.parametrize(("robot", "components"), [("panda", 3), ("ur5", 8), ("xarm7", 4)])
 def test_arms_of_the_catalogue_have_all_their_components_and_no_random_posture_is_better_than_the_bound(
     robot, components
@@ -201,6 +202,7 @@ class WithoutExpression(WithinDistance):
         raise AssertionError("the manifold requests an expression, but this constraint has none")
 
 
+@pytest.mark.long(but=("WithinDistance",))
 @pytest.mark.parametrize("kind", [WithinDistance, WithoutExpression])
 def test_the_bound_leaves_out_infeasible_parts(kind):
     problem = catalogue("panda", normal=(1, 0, 0))

@@ -26,6 +26,7 @@ from tests.support.tools import need, need_compiler
 # ---- the C export -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long(but=("panda, float",))
 @pytest.mark.parametrize(
     ("name", "hands", "real"),
     [("talos", HANDS, DOUBLE), ("panda", ("panda_hand_tcp", "panda_link4"), FLOAT)],

@@ -119,6 +119,7 @@ def test_distance_is_the_tangent_norm_of_small_moves_and_has_the_right_gradient(
 # ---- the curve --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long(but=("standing", "cone", "floating"))
 @EVERY
 def test_the_curve_falls_from_the_initial_posture_to_the_optimum(case: str) -> None:
     solution, curve = solved(case)

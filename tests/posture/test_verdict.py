@@ -36,6 +36,7 @@ def resolved(name: str, **more: object) -> ResolvedImpact:
     return resolve(make_settings({"robot": name, **NORMAL, **CASES[name], **more}))
 
 
+@pytest.mark.long(but=("5.0-talos", "0.3-tilthex_arm", "0.0-panda", "0.3-solo12"))
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("friction", [0.0, 0.3, 5.0])
 def test_the_changes_follow_from_the_predicted_jumps(name: str, friction: float) -> None:

@@ -183,6 +183,7 @@ def test_excluded_and_neighboring_bodies_may_touch(tmp_path: Path) -> None:
     assert frozenset(("trunk", "thigh_fl")) in disabled_links(loaded(tmp_path, QUADRUPED))
 
 
+@pytest.mark.long(but=("lock0-tip", "lock3-wrist"))
 @pytest.mark.parametrize(
     ("lock", "frame"), [((), "tip"), (("elbow",), "tip"), (("wrist", "shoulder"), "hand"), ((), "wrist")]
 )

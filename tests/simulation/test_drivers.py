@@ -65,6 +65,7 @@ def test_nominal_holds_its_posture_after_brace(name: str) -> None:
     assert np.linalg.norm(truth.v) < 0.2
 
 
+@pytest.mark.long(but=("talos-push", "aerial-vertical"))
 @pytest.mark.parametrize("name", SHIPPED)
 def test_robust_lowers_the_metric_after_brace_only(name: str) -> None:
     off = stage(name, "robust")
@@ -127,6 +128,7 @@ def test_all_controllers_share_gains_tasks_and_weights(monkeypatch: pytest.Monke
 # ---- held ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long(but=("talos-push-robust", "aerial-vertical-walker", "solo8-push-robust"))
 @pytest.mark.parametrize("controller", ["robust", "walker"])
 @pytest.mark.parametrize("name", ["aerial-vertical", *PUSHES])
 def test_held_freezes_posture_center_of_mass_and_base(name: str, controller: str) -> None:

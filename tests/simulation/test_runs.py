@@ -47,6 +47,32 @@ ALL += [(name, "walker", "held") for name in ("aerial-vertical", "solo8-push")]
 # ---- completion ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long(
+    but=(
+        "aerial-vertical-nominal-live",
+        "aerial-vertical-robust-live",
+        "aerial-vertical-robust-sticking-live",
+        "aerial-vertical-robust-release-live",
+        "aerial-vertical-invariant-live",
+        "aerial-vertical-walker-live",
+        "aerial-vertical-posture-stiff-live",
+        "aerial-vertical-reference-spreading-live",
+        "aerial-vertical-impact-aware-live",
+        "solo8-push-robust-speed-live",
+        "solo8-push-robust-flow-live",
+        "solo8-push-posture-live",
+        "solo8-push-posture-sticking-live",
+        "solo8-push-stiff-live",
+        "solo8-push-nominal-live",
+        "solo8-push-robust-flow-sticking-live",
+        "solo8-push-walker-held",
+        "talos-push-nominal-live",
+        "talos-push-robust-live",
+        "talos-push-robust-held",
+        "aerial-lateral-robust-held",
+        "aerial-lateral-reference-spreading-live",
+    )
+)
 @pytest.mark.parametrize(("name", "controller", "mode"), ALL)
 def test_every_controller_completes(name: str, controller: str, mode: Mode) -> None:
     # The robot must reach a posture before it can hold the posture.

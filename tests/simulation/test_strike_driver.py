@@ -85,6 +85,7 @@ def height(path: PosturePath, t: float) -> float:
     return float(data.oMf[frame].translation[2])
 
 
+@pytest.mark.long(but=("-0.05",))
 @pytest.mark.parametrize("late", [-0.05, 0.05])
 def test_a_contact_50_ms_early_or_late_is_survived(late: float, monkeypatch: pytest.MonkeyPatch) -> None:
     *_, path = struck()

@@ -107,6 +107,19 @@ def standing(folder: Path, name: str, force: float) -> ControllerFactory:
     return controller_factory(set_up(read_scenario(path)))
 
 
+@pytest.mark.long(
+    but=(
+        "stranger-path",
+        "stranger-strike",
+        "stranger-robust-flow",
+        "stranger-impact-aware",
+        "stranger-posture-stiff",
+        "stranger-walker",
+        "panda-robust",
+        "rail_arm-nominal",
+        "mjcf-robust",
+    )
+)
 @pytest.mark.parametrize(
     ("which", "controller"),
     [("stranger", c) for c in CONTROLLERS]
@@ -127,6 +140,7 @@ def test_an_arm_on_a_fixed_base_meets_a_table(folder: Path, which: str, controll
     assert controller == "impact-aware" or impact.approach == pytest.approx(0.2, rel=0.1)
 
 
+@pytest.mark.long(but=("aligned-5",))
 @pytest.mark.parametrize(("pose", "size"), [("position", 3), ("aligned", 5)])
 def test_the_end_effector_task_can_leave_the_spin_or_orientation_free(folder: Path, pose: str, size: int) -> None:
     """All controllers use this end effector task, and the motion to the offline optimum turns the free axes."""

@@ -189,6 +189,7 @@ def test_nothing_rebounds_without_an_approach_or_from_a_law_without_a_spring() -
     assert ContactLaw(solref=(-1e-6, -1e3)).restitution(0.5, 2.5e-4) == pytest.approx(0.0, abs=1e-9)
 
 
+@pytest.mark.long(but=("0.2", "1.8"))
 @pytest.mark.parametrize("damping", [0.2, 0.6, 1.0, 1.8])
 def test_restitution_converges_to_the_ideal_spring(damping: float) -> None:
     ideal, errors = ideal_restitution(damping), []

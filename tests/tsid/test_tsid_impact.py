@@ -173,6 +173,7 @@ def test_a_spring_that_lets_go_or_follows_reaches_further(exported: dict[str, Im
     assert followed == pytest.approx(released, rel=0.05)
 
 
+@pytest.mark.long(but=("follow",))
 @pytest.mark.parametrize("spring", ["keep", "follow"])
 def test_the_course_of_an_impact_makes_no_step(exported: dict[str, ImpactGradient], spring: str) -> None:
     posture = ImpactRobustPosture(

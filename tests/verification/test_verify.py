@@ -82,6 +82,7 @@ def test_known_robots_pass(name: str) -> None:
     assert_all_there(verify(objective(name), samples=2))
 
 
+@pytest.mark.long(but=("bolt-more1", "tilthex_arm-more2", "ur5-more3"))
 @pytest.mark.parametrize(
     ("name", "more"),
     [
