@@ -73,7 +73,7 @@ class PostureProblem:
                 values["friction"] = objective.contact.friction
         for name in _OF_THE_OBJECTIVE & set(task):
             fault = "belongs to the objective"
-            raise InputError(fault, where=name, hint="give it to ImpactObjective or ImpactContact")
+            raise InputError(fault, where=name, hint="pass the setting to ImpactObjective or ImpactContact")
         settings = validate(ProblemSettings, values | task, "PostureProblem")
         self.prepared: Prepared | None = None
         if isinstance(objective, WorstCaseObjective):

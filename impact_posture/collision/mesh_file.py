@@ -120,7 +120,7 @@ def _parsed(stamp: _Stamp) -> Mesh:
     shape = coal.MeshLoader(coal.BV_AABB).load(str(path), np.ones(3))
     points, triangles = mesh_points(shape), mesh_triangles(shape)
     if len(points) > max(_MOST_VERTICES, stamp[1]):
-        raise UnusableShape(f"{path} repeats its parts to {len(points)} vertices; simplify the mesh")
+        raise UnusableShape(f"{path} repeats its parts, which gives {len(points)} vertices; simplify the mesh")
     if len(triangles) and not 0 <= triangles.min() <= triangles.max() < len(points):
         raise ValueError("the triangles name vertices that do not exist")
     if transform is not None:

@@ -164,8 +164,8 @@ def _model(draft: Draft, robot: Robot, options: LoadOptions, folder: Path) -> No
     spinning = [joint for link in guess.propellers(robot) for joint in guess.joints_to(robot, link)]
     if options.lock or wheels or spinning:
         reasons = ["as --lock says"] if options.lock else []
-        reasons += ["wheels by their names, the base stands still"] if wheels else []
-        reasons += ["propellers by their names, because their spin does not change the impact"] if spinning else []
+        reasons += ["wheels according to their names; the base stands still"] if wheels else []
+        reasons += ["propellers according to their names; their spin does not change the impact"] if spinning else []
         guessed = bool(wheels or spinning)
         draft.key("lock", [*options.lock, *wheels, *spinning], ", and ".join(reasons), guessed=guessed)
     massless = [joint for joint in robot.locked if not any(fnmatchcase(joint, p) for p in options.lock)]
@@ -250,7 +250,7 @@ def _constraints(draft: Draft, robot: Robot, feet: Sequence[Support], carrying: 
     hold = [joint for joint in free if joint in guess.fingers(robot)]
     keys = Draft()
     if hold:
-        keys.key("hold", hold, "fingers and grippers by their names", guessed=True)
+        keys.key("hold", hold, "fingers and grippers according to their names", guessed=True)
     if robot.floating and not feet:
         keys.key("level_base", True, "it floats, upright", guessed=True)
     if feet:
@@ -331,12 +331,12 @@ def _propulsion(draft: Draft, robot: Robot) -> None:
             f"direction = {toml(np.round(axis, 6).tolist())}", f"spin = {2 * (around.index(link) % 2) - 1}",
         ]  # fmt: skip
     text = (
-        "GUESS: these links are propellers by their names. Positions and directions (z axes) are from their frames, "
-        "spins alternate around the center. Replace all other numbers by the data sheet, and uncomment the table, so "
-        "that the thrusts limit the postures:"
+        "GUESS: these links are propellers according to their names. Positions and directions (z axes) are from "
+        "their frames, spins alternate around the center. Replace all other numbers by the data sheet, and uncomment "
+        "the table, so that the thrusts limit the postures:"
     )
     draft.note(text, *lines)
-    draft.guesses.append(f"[propulsion], commented: propellers {', '.join(links)} by their names")
+    draft.guesses.append(f"[propulsion], commented: propellers {', '.join(links)} according to their names")
 
 
 def _file(robot: Robot, otherwise: str) -> str:

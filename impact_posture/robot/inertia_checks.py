@@ -108,7 +108,7 @@ def check_mass_matrix(robot: Robot, where: str) -> None:
         largest = max(float(np.abs(matrix).max()) for matrix in (M, C.T @ M @ C))
     if not largest <= _LARGEST:
         fault = f"the mass matrix has infinite or huge entries at posture '{robot.default_posture}'"
-        hint = "correct the masses, inertias, lengths and `armature`; they are in kg, kg m² and m"
+        hint = "correct the masses, inertias, lengths and `armature`; the units are kg, kg m² and m"
         raise InertiaError(fault, where=where, hint=hint)
     free = diagonal <= _TINY
     if not free.any():

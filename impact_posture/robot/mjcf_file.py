@@ -264,7 +264,7 @@ def _couplings(model: Any, path: Path) -> tuple[JointCoupling, ...]:
             kind = mujoco.mjtEq(int(model.eq_type[k])).name.removeprefix("mjEQ_").lower()
             what = "couples more than two joints" if kind == "tendon" else "closes a kinematic loop"
             fault = f"equality '{object_name(model, 'equality', k)}' ({kind}) {what}, which is not supported"
-            hint = "if it hardly matters, remove it in a copy of the file and `lock` the joints that it guides"
+            hint = "if the equality hardly matters, remove it in a copy of the file and `lock` the guided joints"
             raise MjcfError(fault, where=str(path), hint=hint)
         followers.add(first)
         name, start = object_name(model, "joint", first), model.qpos0[model.jnt_qposadr[first]]
@@ -273,7 +273,7 @@ def _couplings(model: Any, path: Path) -> tuple[JointCoupling, ...]:
         if second < 0 or not (ratio or any(curved)):
             model.jnt_limited[first], model.jnt_range[first] = 1, start + constant
         elif any(curved):
-            hint = "make it linear in a copy of the file, or remove it and `lock` the joint"
+            hint = "make the coupling linear in a copy of the file, or remove it and `lock` the joint"
             raise MjcfError(f"joint '{name}' follows another by a polynomial", where=str(path), hint=hint)
         else:
             offset = start + constant - ratio * model.qpos0[model.jnt_qposadr[second]]

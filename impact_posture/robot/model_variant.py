@@ -85,7 +85,7 @@ def _factors(robot: Robot, armature_range: tuple[float, float] | None) -> list[f
     if not armature[np.isfinite(armature)].any():
         none = robot.armature.any() and f"no armature with the joint model '{robot.joint_model}'"
         fault = f"{robot.name} has {none or 'no armature'}, so a factor changes nothing"
-        hint = "leave it out" if none else "state one with `armature` or in robot.toml"
+        hint = "leave it out" if none else "state an armature with `armature` or in robot.toml"
         raise InputError(fault, where="armature_range", hint=hint)
     return [1.0, *sorted({low, high} - {1.0})]
 

@@ -149,7 +149,7 @@ def _in_order(robot: Robot, data: Mapping[str, object], where: str) -> Array:
             missing = [name for name in robot.joint_names if name not in names]
             fault = f"leaves out joint '{missing[0]}'" if missing else "has the joints in another order"
             fault = f"{fault}, so that q cannot be read"
-            raise PostureError(fault, where=where, hint='give them by name: "joints": {"name": value}')
+            raise PostureError(fault, where=where, hint='give the joints by name: "joints": {"name": value}')
     if data.get("q_names", list(robot.q_names)) != list(robot.q_names):
         fault = "has q_names that do not fit the robot, so q cannot be read"
         raise PostureError(fault, where=where, hint='give the joints by name: "joints": {"name": value}')

@@ -280,7 +280,7 @@ def _check_limits(model: pin.Model, source: str) -> None:
         for k in np.flatnonzero(swapped[q_slice(model, index)]) + model.idx_qs[index]:
             limits = f"{model.lowerPositionLimit[k]:g}, {model.upperPositionLimit[k]:g}"
             fault = f"the lower position limit of '{model.names[index]}' is above its upper limit ({limits})"
-            raise UrdfError(fault, where=source, hint="swap them there, or give robot.toml [limits.position]")
+            raise UrdfError(fault, where=source, hint="swap the limits there, or give robot.toml [limits.position]")
 
 
 def _beside(model: pin.Model) -> tuple[str, ...]:

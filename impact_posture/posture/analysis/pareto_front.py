@@ -259,7 +259,7 @@ class _Curve:
         if risen:
             notes.append(
                 f"trade-off: within {', '.join(f'{p.within:.3g}' for p in risen)} the posture is worse than "
-                "within a smaller bound, so it is not the best there"
+                "within a smaller bound, so it is not the best posture there"
             )
         lowest = min(p.objective for p in points)
         if lowest < best - _RISE * self._scale and not solution.problem.requirements.regularization:

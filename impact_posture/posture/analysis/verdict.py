@@ -117,7 +117,7 @@ def verdict(
 
 def _sentence(outcome: str, refuted: bool, later: bool) -> str:
     if refuted:
-        return f"If it arrived, it would be {outcome}"
+        return f"If it arrived, the posture would be {outcome}"
     return outcome.capitalize() if later else outcome
 
 

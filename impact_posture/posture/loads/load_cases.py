@@ -137,7 +137,7 @@ def _unlimited(robot: Robot) -> list[str]:
     passive = [slot.name for slot in slots if slot.name not in driven]
     limit = "no effort limit above zero is stated; state it in robot.toml [limits.effort]"
     torque = f"at rest, the torque of {listed(driven)} is not checked, because {limit}"
-    balance = f"at rest, the balance of {listed(passive)} is not checked, because nothing drives it"
+    balance = f"at rest, the balance of {listed(passive)} is not checked, because no actuator drives it"
     return [torque] * bool(driven) + [balance] * bool(passive)
 
 

@@ -30,7 +30,7 @@ def notes_on_impacts(objective: Objective, initial: Array, q: Array) -> list[str
         if after < _LOCKED * before:
             notes.append(
                 f"the contact{where} is nearly locked along the normal there: its effective mass is "
-                f"{before / max(after, 1e-300):.3g} times its initial value, and so is the impulse at a given "
+                f"{before / max(after, 1e-300):.3g} times its initial value, as is the impulse for a given "
                 "approach speed; compare V and S, or minimize them (`objective` auto)"
             )
     return notes
