@@ -113,7 +113,7 @@ def equality(ticks: int) -> Iterator[str]:
     """Yield a table of the differences between both controllers in the same states."""
     some, most = controller_equality.SOME, controller_equality.MOST
     yield (
-        f"{ticks} ticks of each kind of states. Errors of controls are relative to the largest control. *Its own*: "
+        f"{ticks} ticks for each kind of states. Errors of controls are relative to the largest control. *Its own*: "
         "largest change of Python's controls, in ticks over 1e-9, if the last digit of each number in the program "
         f"changes. In ticks with different answers (the first {most}), and in every {some}th relaxed tick: largest "
         "violation of hard constraints, and largest residual of optimality, by an independent certificate."

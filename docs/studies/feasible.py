@@ -51,7 +51,7 @@ def lines(request: Request) -> Iterator[str]:
     yield "the free problem at which collision shapes touch each other, the surface or the ground. *loss*:"
     yield "increase of the objective of the best posture. *left out*: number of certified solutions that the"
     yield "check of the original shapes rejected. *ms*: median time of a start. *a start*: this median, divided"
-    yield "by the median of a free search just before. *search*: the same ratio for the time of the whole"
+    yield "by the same median of the free search just before. *search*: the same ratio for the time of the whole"
     yield f"search, which repeats some starts. Both ratios are medians over {request.count} seeds. *certified* is"
     yield "the smallest number over the seeds, *left out* is the sum. All of these searches finish every start."
     yield "The default stops starts that can no longer become the best. *left*: number of stopped starts."

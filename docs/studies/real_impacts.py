@@ -104,7 +104,7 @@ def result(scenario: str, name: str) -> dict[str, Any]:
 
 def lines(request: Request) -> Iterator[str]:
     controllers = [c for c in COMPARED if c in CONTROLLERS]
-    # At other speeds, only the nominal controller runs, and the controllers for which the objective matters.
+    # At other speeds, only the nominal controller, `robust`, and the variants for the objective `sticking` run.
     others = [c for c in controllers if c.endswith(("nominal", "robust", "sticking"))]
     pairs = [(s, c) for s in SCENARIOS if request.only in s for c in (others if " " in s else controllers)]
     answers = collected(lambda k: result(*pairs[k]), len(pairs), request.jobs, "runs")

@@ -100,9 +100,9 @@ def gains(main: Reproduction) -> Iterator[str]:
         "" if stiff is None else f" `stiff`, as stiff as the term at the shipped K, gives {reduction_text(stiff)}."
     )
     if not reached:
-        yield f"No K in this table reaches the paper's {100 * wanted:.1f} %.{beside}"
+        yield f"No K in this table reaches the paper's reduction of {100 * wanted:.1f} %.{beside}"
     elif (k := reached[0]) == 0:
-        yield f"Every K in this table reaches the paper's {100 * wanted:.1f} %.{beside}"
+        yield f"Every K in this table reaches the paper's reduction of {100 * wanted:.1f} %.{beside}"
     else:
         low, high = reductions[k - 1], reductions[k]
         factor = _GAINS[k - 1] + (wanted - low) / (high - low) * (_GAINS[k] - _GAINS[k - 1])

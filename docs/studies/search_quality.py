@@ -42,7 +42,7 @@ _TUNED = 60
 _MANY = 1024
 # Seed of these starts.
 _OTHER_SEED = 1000
-# An objective within this share of the best known one counts as reached.
+# The best known objective counts as reached if an objective is above it by at most this share.
 _REACHED = 0.01
 # Goals: share of runs that reach the best known objective, and median time divided by the time of 16 starts.
 _SHARE, _TIMES = 0.95, {"random arms": 3.0, "arms": 3.0, "humanoids": 1.5}
@@ -202,5 +202,5 @@ class _Known:
             self._path.write_text(json.dumps(self._best, indent=1) + "\n")
 
     def above(self, case: str, objective: float) -> float:
-        """Return the share by which an objective is above the best known one."""
+        """Return by which share an objective is above the best known objective."""
         return objective / self._best[case] - 1

@@ -99,7 +99,7 @@ def struck(case: str, name: str, seed: int, offline: Callable[..., OfflinePostur
 def results(case: str, name: str, seeds: range) -> list[dict[str, Any]]:
     """Return the results of all seeds.
 
-    The optimum is computed once, because it does not depend on the spread, except in a fall, whose height varies.
+    The optimum is computed once, but for falls once for each seed, because the seed changes the height of a fall.
     """
     first: list[OfflinePosture] = []
 
@@ -133,7 +133,7 @@ def _tables(request: Request, cases: Sequence[str], controllers: Sequence[str]) 
     yield (
         f"Each number is the median over {len(seeds)} seeds, followed by the worst value in parentheses. Bars "
         f"(largest allowed errors): speed within "
-        f"{SPEED:.0%} of the stated one, instant within {1e3 * INSTANT:g} ms, no saturation before the contact, "
+        f"{SPEED:.0%} of the stated speed, instant within {1e3 * INSTANT:g} ms, no saturation before the contact, "
         f"measured jump within {RATIO:.0%} of the predicted one, all runs completed. A seed changes the speed by "
         f"at most {SPREAD.speed:.0%}, tilts the surface by at most {SPREAD.normal:g}°, and shifts it by at most "
         f"{1e3 * SPREAD.gap:g} mm. The controllers do not know tilt and shift."

@@ -199,7 +199,7 @@ def _larger(pair: Pair) -> Pair:
     ],
 )
 def test_a_number_beyond_its_bar_needs_a_reason(angular: float, still: float, long: bool, reason: str | None) -> None:
-    """The predicted angular velocity is 1 or 0.05 rad/s, at 1 m/s."""
+    """The predicted angular velocity is 1 or 0.05 rad/s, at an approach speed of 1 m/s."""
     predicted = Numbers(1.0, 1.0, 1.0 if angular > 1 else 0.05, 1.0, 1.0, 1.0, False, {}, frozenset())
     sides = (replace(predicted, angular=value) for value in (angular, still))
     pair = Pair(predicted, *sides, named=True, speed=1.0, time=0.02, unsolved=0)

@@ -89,7 +89,7 @@ def recording() -> Iterator[list[RelaxedTick]]:
 
 
 def pushed(name: str) -> tuple[list[RelaxedTick], int]:
-    """Push a simulated robot with its nominal controller.
+    """Push a simulated robot that runs its nominal controller.
 
     Returns:
         The relaxed ticks, and how many of them precede the fall (base a third lower than at the start).

@@ -186,7 +186,7 @@ class HoldingTime:
 
 @dataclass(frozen=True)
 class Compared:
-    """Rows of one case at one friction, shortest contact times with which its feet stay, and why rows are missing."""
+    """Rows of one case and friction coefficient, contact times with which its feet stay, reasons for missing rows."""
 
     rows: tuple[Row, ...]
     held: tuple[HoldingTime, ...]
