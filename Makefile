@@ -122,6 +122,7 @@ study-hits: $(VENV)/.installed-test
 study-global: $(VENV)/.installed-test
 	$(BIN)/python -m docs.studies global --write
 	$(BIN)/python -m docs.studies search --seed 1 --write
+	$(BIN)/python -m docs.studies screening --write
 
 study-feasible: $(VENV)/.installed-test
 	$(BIN)/python -m docs.studies feasible --write

@@ -83,6 +83,9 @@ STUDIES = {
         Study("global", "global_search:maps", "self-motions and their bounds; seeds", 10, target="study-global"),
         Study("search", "search_quality:arms", "the default search and 16 starts; seeds", 3, target="study-global"),
         Study("search-catalogue", "search_quality:catalogue", "default search, catalogue; seeds", 3, page=False),
+        Study(
+            "screening", "random_postures", "random postures of talos; postures", 100_000_000, target="study-global"
+        ),
         Study("flow", "flow", "where the reference flow rests, from random starts", 1000, target="study-flow"),
         Study("strikes", "strikes", "planned strikes; seeds", 10, target="study-strikes", parts=True),
         Study("landing", "strikes:landing", "a fall onto four feet; seeds", 10, target="study-strikes", parts=True),
