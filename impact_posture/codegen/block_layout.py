@@ -97,8 +97,8 @@ def lay_out(
 def _slots(graph: Graph, blocks: Sequence[Block], last: Mapping[int, int]) -> tuple[dict[int, int], dict[int, int]]:
     """Return indices in the work arrays for values that later blocks use, and the lengths of the arrays.
 
-    All functions call blocks in the same order.  After the ``last`` block that uses a value, another value can
-    therefore use the same index.
+    All functions call blocks in the same order.  Therefore, the index of a value can be used again after the block
+    ``last[value]``, which is the last to use the value.
     """
     slots: dict[int, int] = {}
     sizes: dict[int, int] = {}

@@ -25,8 +25,8 @@ LARGEST_VECTOR = 64
 # Stack bytes for return addresses, saved registers, alignment and the variables of the small functions.  The stack
 # contains the variables of only one block at a time, because the macro APART prevents the inlining of blocks.
 _FRAMES = 2048
-# With -march=native, a compiler can combine neighboring numbers into vectors.  Such code uses up to this factor more
-# stack, because several vectors may contain the same number.
+# With -march=native, a compiler can combine neighboring numbers into vectors.  With vectors, the code uses at most
+# this factor more stack, because several vectors may contain the same number.
 _SPILL = 2
 
 # Largest number of statements in a block of a batch.  A block of this size fits the first-level cache while it
@@ -119,8 +119,8 @@ def _generate(
     normals = {v.stem: (single[0] if v.joint else v).objective.contact.normal for v in exported}
     robot = single[0].objective.robot
     scalars = library.graph()
-    # In a single call, the processor waits for the results of operations, so a good order of sums saves time.  In a
-    # batch, the processor computes other configurations meanwhile, so the batch uses the original order.
+    # In a call for one configuration, the processor waits for results of operations, so a good order of sums saves
+    # time.  In a batch, the processor computes other configurations meanwhile, so the batch uses the original order.
     graph = reorder_sums(scalars if portable else library.vector_graph())
     layout = lay_out(graph, [f.outputs for f in library.functions])
     constants = Constants(prefix, real)
@@ -198,7 +198,7 @@ def _variables(
 
 
 def _lanes(function: Exported, scalars: Graph, real: Real, constants: Constants) -> dict[str, Any]:
-    """Return the variables of a batch of vectors of configurations; empty if an operation has no vector form in C."""
+    """Return the template variables of a batch in vector form; empty if an operation has no vector form in C."""
     layout = lay_out(scalars, [function.outputs], _BATCH_BLOCK)
     computed = {k for block in layout.blocks for k in block.nodes} | layout.inlined
     if not all(k in layout.trig or scalars.nodes[k].op in ARITHMETIC for k in computed):

@@ -39,7 +39,7 @@ class ImpactGradient:
     the next call of the same method overwrites.**  Copy a result if you need it after the next call.  Use an object
     in one thread only; :meth:`copy` returns an object for another thread.  Calls release the global interpreter lock.
 
-    The methods for a single configuration raise these errors:
+    The methods for one configuration raise these errors:
 
     - ``InputError``: A number is not finite.
     - ``PostureError``: A quaternion or cosine-sine pair is not of unit norm.
@@ -264,7 +264,8 @@ class ImpactGradient:
             arrays = [ctypes.c_void_p(array[first:last].ctypes.data) for array in (*inputs, value, grad)]
             call(*arrays[: len(inputs)], ctypes.c_int(last - first), *arrays[len(inputs) :])
 
-        # Each thread computes one contiguous part, because ctypes releases the interpreter lock during a call.
+        # Each thread computes one contiguous part.  The threads run in parallel, because ctypes releases the
+        # interpreter lock during a call.
         bounds = np.linspace(0, count, max(1, min(threads, count // _LEAST_ROWS)) + 1).astype(int)
         if len(bounds) == 2:
             part(0, count)

@@ -48,8 +48,8 @@ def order_by_limb(graph: Graph, outputs: Sequence[str], limb_of: Mapping[int, in
 def _limbs(graph: Graph, order: Sequence[int], leaves: set[int], limb_of: Mapping[int, int]) -> dict[int, int]:
     """Return node → limb on whose joints the node depends; 0 if it depends on no limb or on several limbs.
 
-    A value that depends on the body and on one limb belongs to the limb.  The exception is a partial sum over limbs,
-    which only the body uses.
+    A value that depends on the body and on one limb belongs to the limb.  A partial sum over limbs that only the body
+    uses is an exception: it belongs to no limb.
     """
     nodes, limb = graph.nodes, dict[int, int]()
     users: dict[int, set[int]] = {}

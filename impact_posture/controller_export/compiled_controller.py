@@ -38,7 +38,7 @@ class CompiledController:
 
     Attributes:
         manifest: The content of ``<prefix>.json``.
-        parameters: Parameter name → values, shape (size,).  The next :meth:`reset` reads these values.
+        parameters: Parameter name → values, shape (size,).  Changes take effect at the next :meth:`reset`.
         targets: Task name → target of the task as stored in the memory of the C code, shape (25,).
     """
 

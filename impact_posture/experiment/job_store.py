@@ -109,7 +109,7 @@ class JobStore:
         return document
 
     def series(self, job: Job, sign: int) -> Path:
-        """Return the path of the time series of a job for this sign of its push."""
+        """Return the path of the time series of the run of a job with the push sign ``sign``."""
         return self._path(job).with_suffix(f"{'' if sign > 0 else '.minus'}.npz")
 
     def keep(self, job: Job, document: Document, runs: Sequence[Run] = ()) -> None:

@@ -91,7 +91,7 @@ def _mean(value: Interval | None) -> float:
 def missed_targets(row: ControllerRow) -> dict[str, str] | None:
     """Return the targets that a row misses: name → description of the miss.
 
-    Return ``None`` for the nominal controller and for a row without reduction, because they have no targets.
+    Return ``None`` for the nominal controller and for a row without reduction, because such rows have no targets.
     """
     if row.reduction is None or row.recovery is None or row.controller == "nominal":
         return None

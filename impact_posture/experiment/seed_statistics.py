@@ -131,7 +131,7 @@ def headline(row: Document, nominal: Document) -> str:
     if abs(row["force"]["mean"] - 1) > _SAME:
         costs.append(f"peak force × {row['force']['mean']:.2g}")
     parts.append(", ".join(costs))
-    # Results of older versions do not contain the impulse.
+    # Results of older versions of this package do not contain the impulse.
     if "impulse" in row["change"]:
         parts.append(_outcome(row, nominal))
     return "; ".join(parts)
@@ -152,7 +152,7 @@ def _outcome(row: Document, nominal: Document) -> str:
 def _load(means: Mapping[str, float], joint: Document | None) -> ImpactLoad:
     """Return the effects on base, joints and contact, given the mean of each of :data:`QUANTITIES`.
 
-    ``joint`` is the worst joint.
+    ``joint`` describes the joint with the largest load.
     """
     worst = joint and WorstJoint(joint["name"], means["joint_velocity"], joint["unit"], means.get("joint_share"))
     base = means.get("base_linear"), means.get("base_angular")

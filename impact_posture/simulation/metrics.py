@@ -13,9 +13,9 @@ from impact_posture.simulation.setup import Setup
 
 # The velocity jump is measured within this time after the first touch, s.
 JUMP = 0.015
-# Words for the time ``JUMP``.
+# Words in figures and tables for the time ``JUMP``.
 AFTER_TOUCH = f"{1e3 * JUMP:g} ms of the touch"
-# Words for the recovery window.
+# Words in figures and tables for the time window in which the recovery is measured.
 UNTIL_RECOVERY = f"until {RECOVERY:g} s after each impact began"
 # A command is saturated if its distance from a limit is below this share of the range.
 _NEAR = 1e-3
@@ -48,10 +48,10 @@ class Metrics:
         contacts_asked: Number of contacts (or pushes) that the scenario requests.
         rested: Whether the robot was at rest before the push or throw; true for contacts.
         base_linear: Largest change of the linear velocity of a floating base in the time interval of ``peak_jump``,
-            averaged over the contacts, m/s.  ``None`` for a fixed base, or without contact.
+            averaged over the contacts, m/s.  ``None`` for a fixed base or if there was no contact.
         base_angular: Like ``base_linear``, but of the angular velocity, rad/s.
         joint: Joint with the largest change of velocity relative to its velocity limit, in the time interval of
-            ``peak_jump`` of any contact.  ``None`` without contact.
+            ``peak_jump`` of any contact.  ``None`` if there was no contact.
         impulse: Impulse of the contact along the normal in the time interval of ``peak_jump``, averaged over the
             contacts, N·s.  For pushes, the impulse of the push.
     """

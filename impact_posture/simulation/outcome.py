@@ -28,8 +28,8 @@ OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)
 _EVERY = 25
 # Largest number of pairs of touching links that a warning lists.
 _MOST = 4
-# A link has moved through a surface if its joint origin is farther than this behind the surface, m.  Contacts are
-# compressed less than this.
+# A link has moved through a surface if its joint origin is farther than this behind the surface, m.  The penetration
+# of a simulated contact is smaller.
 _DEEP = 0.02
 # The prediction fits if the measured velocity jump divided by the predicted velocity jump is in this range.
 _FITS = (0.67, 1.5)

@@ -262,8 +262,7 @@ def _settle(loop: _Loop, task: SinglePush | Throw, least: float, brace: list[Cal
             return False
         if brace and loop.t >= BRACE - SAME:
             brace.pop()()
-        # Run all ticks until the earliest of the times ``waits`` in one call, because nothing can change before this
-        # time.
+        # Run all ticks until the earliest time in ``waits`` in one call, because nothing can change before this time.
         waits = [max(least, loop.t + task.still - still), end, *([BRACE] if brace else [])]
         for speed in loop.ticks(min(map(loop.until, waits))):
             still = still + loop.period if speed < task.quiet else 0.0

@@ -60,7 +60,7 @@ class Series:
         force: Force on the shape of the task, or force of the push, world, N, shape (n, 3).
         peak: Largest normal force on the shape of the task within the tick, N, shape (n,).
         impulse: Impulse of ``force`` since the start, world, N·s, shape (n, 3); NaN in files of older versions.
-        slip: Sliding speed of the shape of the task, or of the fastest foot for pushes, m/s, shape (n,).
+        slip: Sliding speed of the shape of the task, m/s, shape (n,).  For pushes: sliding speed of the fastest foot.
         touching: Number of shapes in contact, shape (n,).
         feet: Whether each supporting foot is in contact, shape (n, feet).
         objective: H of the impact, shape (n,); NaN in ticks in which H was not evaluated.

@@ -47,7 +47,7 @@ class PointResult(NamedTuple):
 
     Attributes:
         row: Column name → value of the grid point in the table.
-        start: Posture of the grid point, from which other points can start; ``None`` without a posture.
+        start: Posture of the grid point, from which other points can start; ``None`` if no posture was found.
         violation: Smallest known weighted sum of all constraint violations; 0 if the grid point is not infeasible.
     """
 
@@ -57,7 +57,7 @@ class PointResult(NamedTuple):
 
     @property
     def q(self) -> Array | None:
-        """Posture of the grid point, shape (nq,); ``None`` without a posture."""
+        """Posture of the grid point, shape (nq,); ``None`` if no posture was found."""
         return self.start and self.start.q
 
 
@@ -84,7 +84,7 @@ class Walk:
         self._relaxed: ElasticProgram | None = None
 
     def grow(self, problem: ConstrainedProblem) -> None:
-        """Use ``problem``, which has additional body pairs, for this and the next points."""
+        """Use ``problem``, which has additional body pairs, for the present point and all later points."""
         self.problem, self.nlp = problem, self.nlp.grown(problem, compile="never")
 
     def at(self, problem: ConstrainedProblem, place: Place) -> ConstrainedProblem:
@@ -107,9 +107,9 @@ class Walk:
 def search(walk: Walk, place: Place, guesses: Sequence[Start], beside: float = 0.0) -> PointResult:
     """Solve one grid point from the optima of its neighbors and from the given posture.
 
-    If these starts lead to different optima, random starts are added.  ``beside`` is the smallest violation at
-    infeasible neighbors, or 0 if a neighbor has an optimum.  If ``beside`` is positive, the point is probably
-    infeasible.
+    If these initial postures lead to different optima, random initial postures are added.  ``beside`` is the smallest
+    violation at infeasible neighbors, or 0 if a neighbor has an optimum.  If ``beside`` is positive, the point is
+    probably infeasible.
     """
     attempt = _Attempt(walk, place, (walk.settings.starts or STARTS) - 1)
     try:

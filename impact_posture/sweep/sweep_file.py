@@ -159,7 +159,7 @@ class Sweep:
         return 1 if self.shards_of_case == 1 else 2
 
     def span(self, shard: int) -> tuple[int, range]:
-        """Return the number of the case of a shard, and the points of the shard as indices into the grid."""
+        """Return the number of the case to which a shard belongs, and the indices of its grid points."""
         case, part = divmod(shard, self.shards_of_case)
         first = part * self.shard
         return case, range(first, min(first + self.shard, self.grid.size))

@@ -169,7 +169,7 @@ def _move(names: Sequence[str], new: Path, out: Path, old: Path, force: bool) ->
 
 
 def _place(new: Path, target: Path, old: Path) -> None:
-    """Move the file ``new`` to ``target``; if a file exists there, the link ``old`` keeps it."""
+    """Move the file ``new`` to ``target``.  A file that exists at ``target`` is kept as the hard link ``old``."""
     if os.path.lexists(target):
         _link(target, old)
         os.replace(new, target)

@@ -25,7 +25,7 @@ _GUARD = (
 
 
 def find_compiler() -> list[str] | None:
-    """Return the first installed compiler of ``$CC`` (with options), cc, gcc and clang; ``None`` without a compiler.
+    """Return the first installed compiler of ``$CC`` (with options), cc, gcc and clang; ``None`` if there is none.
 
     Raises:
         CompilerError: ``$CC`` has an open quote.

@@ -44,7 +44,8 @@ class Assembly:
         rank: Finds dependent rows of the strict levels, and contains the QP without them.
         levels: Names and rows of the strict levels, the most important first.  If there are hard contacts, the first
             entry is ``contacts``.
-        limits: Indices of the entries of ``[z; A z]`` that joint limits or limits of expected impacts bound.
+        limits: Indices of the entries of ``[z; A z]`` with bounds from joint limits or from limits of expected
+            impacts.
         names: Name of each entry of ``[z; A z]``.
     """
 

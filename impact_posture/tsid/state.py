@@ -147,7 +147,7 @@ class State:
         return self._com
 
     def displaced(self, step: float) -> State:
-        """Return another state at ``(q ⊕ step·ν, ν)``, for finite differences along the motion."""
+        """Return a second state object at ``(q ⊕ step·ν, ν)``, for finite differences along the motion."""
         if self._aside is None:
             self._aside = State(self.robot, self.points)
         return self._aside.update(pin.integrate(self._model, self.q, step * self.v), self.v)

@@ -69,8 +69,8 @@ class SupportContact:
     def cone(self, rotation: Array) -> Array:
         """Return the matrix ``C`` of the friction cone ``C f ≥ 0`` in world axes, shape (rows, size).
 
-        The first row is the normal force.  ``rotation`` is world from frame, shape (3, 3).  The x axis of a sole is
-        the x axis of the frame.
+        The first row of ``C f`` is the normal force.  ``rotation`` is world from frame, shape (3, 3).  The x axis of
+        a sole is the x axis of the frame.
 
         Raises:
             ContactError: The sole stands on its edge.

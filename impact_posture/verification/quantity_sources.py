@@ -144,7 +144,7 @@ def compiled_source(objective: WorstCaseObjective) -> Iterator[Source]:
 
 
 def _impulse(objective: WorstCaseObjective) -> WorstCaseObjective:
-    """Return the objective of the type ``impulse``, which is defined at every posture and has the same ``H``."""
+    """Return an objective with the same ``H``, but of the type ``impulse``, which exists at every posture."""
     return replace(objective, kind="impulse")
 
 

@@ -54,8 +54,8 @@ class VerificationRow:
             skipped or fails.
         verdict: ``pass``, ``fail``, or ``skipped`` if the source is not available on this machine.
         error: Largest relative error over all samples; ``None`` if it is not finite or was not computed.
-        tolerance: Largest relative error that passes; ``None`` without a comparison.
-        sample: Number of the sample with the largest error, starting at 0; ``None`` without a comparison.
+        tolerance: Largest relative error that passes; ``None`` if nothing was compared.
+        sample: Number of the sample with the largest error, starting at 0; ``None`` if nothing was compared.
         entry: Entry of the quantity with the largest error; empty for a scalar.
         note: Reason why the source is skipped or fails.
     """

@@ -13,7 +13,7 @@ static double ip_largest(const double *x, int first)
 }
 
 /* Return the change of a limited quantity (row r) that a displacement causes.  A rotation of the base across the tilt
- * axis increases the tilt to second order. */
+ * axis increases the tilt only to second order. */
 static double ip_flow_ahead(const ip_flow *f, int r, const double *moved)
 {
   const double along = r < IP_JOINTS_V               ? moved[IP_BASE + r]

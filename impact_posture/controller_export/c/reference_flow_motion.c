@@ -257,8 +257,8 @@ static int ip_flow_begin(ip_context *c)
   return 1;
 }
 
-/* Do the part of the eigenvalue decomposition of the curvature that belongs to this tick.  At the last of these
- * ticks, also compute the axes of the Newton step. */
+/* Do the part of the eigenvalue decomposition of the curvature that is due at this tick.  At the tick of the last
+ * part, also compute the axes of the Newton step. */
 static void ip_flow_curve(ip_context *c)
 {
   enum { BEND = 7, TRIDIAGONAL = 8, LAST = 12 };

@@ -68,7 +68,7 @@ class _State:
 def ellipsoid_figure(view: ResultView) -> Figure:
     """Draw Λ_c at the start (dashed) and at the optimum (solid), projected onto planes and in 3-D, with √H along n.
 
-    The planes are the coordinate planes.  If none of them contains n, the upright plane through n is added.
+    The planes are the coordinate planes.  If no coordinate plane contains n, the upright plane through n is added.
     Projections onto planes that contain n have tangent lines at ±√H.  All panels have the same scale, equal in all
     directions.  Thin lines show the ellipsoids without support feet.  For an uncertain normal, the figure shows the
     cone of normals and the worst normals.

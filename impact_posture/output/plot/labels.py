@@ -39,7 +39,7 @@ class Label(Annotation):
         )  # fmt: skip
         self.point = np.asarray(point, dtype=float)
         self.toward = toward
-        # Letters get their positions after the layout, so the layout must ignore them.
+        # Letters get their positions after the layout of the figure, so the layout must ignore letters.
         self.set_in_layout(False)
 
 

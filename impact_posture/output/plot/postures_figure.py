@@ -50,7 +50,7 @@ class DrawnSurface:
         point: Center of the square, shape (3,).
         normal: Unit normal, shape (3,).
         side: Side of the square, m.
-        contact: Tail of the arrow, shape (3,).
+        contact: Contact point, at which the arrow starts, shape (3,).
         reach: Length of the arrow, m.
         name: Letters next to the arrow.
         color: Color of the posture; gray for a plane that both postures share.

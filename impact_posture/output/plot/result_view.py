@@ -119,7 +119,7 @@ class ResultView:
 
     @cached_property
     def worst(self) -> tuple[WorstNormal | None, WorstNormal | None]:
-        """Worst normals at the start and at the optimum, world; ``None`` without a cone or if they are undefined."""
+        """Worst normals at the start and at the optimum, world; ``None`` if undefined or without a cone."""
 
         def worst(q: Array) -> WorstNormal | None:
             try:

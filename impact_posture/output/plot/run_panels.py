@@ -59,7 +59,7 @@ def whole(view: RunView) -> Clip:
 
 
 def first_impact(view: RunView) -> Clip | None:
-    """Return the clip of the first impact window with a margin, in ms; ``None`` without an impact."""
+    """Return the clip of the first impact window with a margin, in ms; ``None`` if there was no impact."""
     if not view.impacts:
         return None
     window = view.impacts[0]

@@ -42,7 +42,7 @@ class RunView:
         objective: H of the impact, shape (n,); NaN if it was not evaluated.
         level: Activation of the impact-robust term, 0 to 1, shape (n,).
         at_stop: Whether a joint is at a position limit, shape (n, nv).
-        windows: Time windows.  Figures shade the kinds ``impact`` and ``dwell``.
+        windows: Time windows.  Figures shade windows of the kinds ``impact`` and ``dwell``.
         surface: A point on the surface, world, m, shape (3,); ``None`` for a push.
         supports: Feet that stay on the ground.
         label: Name of the run in figures of several runs; empty for the name of the controller.
@@ -129,19 +129,19 @@ class RunView:
         for joint in range(1, model.njoints):
             if int(model.nvs[joint]) == 1:
                 at, v = int(model.idx_qs[joint]), int(model.idx_vs[joint])
-                # Pinocchio stores the cosine and sine of a continuous joint.
+                # For a continuous joint, q contains the cosine and sine of the angle.
                 endless = int(model.nqs[joint]) == 2
                 positions[:, v] = np.unwrap(np.arctan2(q[:, at + 1], q[:, at])) if endless else q[:, at]
         return positions[:, self.robot.first_joint :]
 
     @property
     def torque_limits(self) -> Array:
-        """Torque limit of each joint, N·m (N), shape (joints,); infinite without a limit."""
+        """Torque limit of each joint, N·m (N), shape (joints,); infinite for a joint without a limit."""
         return torque_limits(self.robot.model)[self.robot.first_joint :]
 
     @property
     def rotor_limits(self) -> tuple[float, float] | None:
-        """Lowest and highest rotor speed; ``None`` without rotors."""
+        """Lowest and highest rotor speed; ``None`` for a robot without rotors."""
         propulsion = self.robot.spec.propulsion
         return None if propulsion is None else (propulsion.speed_min, propulsion.speed_max)
 

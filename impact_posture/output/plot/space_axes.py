@@ -19,7 +19,7 @@ class Space(Axes3D):  # type: ignore[misc]
     """3-D axes whose layout has space for the axis names."""
 
     def get_tightbbox(self, renderer: Any = None, **more: Any) -> Any:
-        """Return the box around the axes with their names.  Matplotlib ignores the names in the layout."""
+        """Return the box around the axes with their names, which Matplotlib would ignore in a layout."""
         return super().get_tightbbox(renderer, **(more | {"for_layout_only": False}))
 
 

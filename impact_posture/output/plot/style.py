@@ -37,7 +37,7 @@ AFTER: dict[str, Any] = {"color": BLUE, "linestyle": "-", "linewidth": 1.6, "zor
 # Lines for the robot without supports are thinner and have other dashes.
 FREE_BEFORE: dict[str, Any] = {"color": VERMILLION, "linestyle": (0, (1, 1.6)), "linewidth": 1.0, "zorder": 2.8}
 FREE_AFTER: dict[str, Any] = {"color": BLUE, "linestyle": (0, (6, 1.6, 1, 1.6)), "linewidth": 0.9, "zorder": 2.6}
-# Arrows of the worst normals of a cone.
+# Styles of the arrows that show the worst normals of a cone.
 WORST_BEFORE: dict[str, Any] = {"color": VERMILLION, "linestyle": (0, (3, 1.5)), "linewidth": 1.1}
 WORST_AFTER: dict[str, Any] = {"color": BLUE, "linestyle": "-", "linewidth": 1.1}
 BEFORE_BAR: dict[str, Any] = {"facecolor": "#fbe3d3", "edgecolor": VERMILLION, "hatch": "//////", "linewidth": 0.6}

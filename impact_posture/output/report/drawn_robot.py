@@ -52,7 +52,7 @@ class Solid:
     """Triangle mesh with rounded corners.
 
     Attributes:
-        corners: Corners as integer multiples of ``step`` from ``low``, shape (k, 3).
+        corners: Offsets of the corners from ``low`` as integer multiples of ``step``, shape (k, 3).
         faces: Corner indices of each triangle, shape (n, 3).
         low: Lower corner of the bounding box, m, shape (3,).
         step: Size of a rounding step, m.
@@ -127,7 +127,7 @@ class DrawnRobot:
 def draw_robot(robot: Robot, meshes: bool = False) -> DrawnRobot:
     """Return the visual shapes of a robot.  Hulls replace meshes whose license does not permit copies.
 
-    A robot without shapes gets sticks.  If ``meshes`` is true, the user permits copies of all meshes.
+    A robot without shapes is drawn as sticks.  If ``meshes`` is true, the user permits copies of all meshes.
     """
     described, warnings, _ = read_shapes(robot, "visual")
     by_name = {shape.name: shape for shape in described}

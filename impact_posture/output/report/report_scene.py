@@ -28,8 +28,7 @@ from impact_posture.system.arrays import Array
 _TYPES = {"uint16": "u2", "uint32": "u4", "float32": "f4"}
 # Candidates for the initial direction from the center to the camera.
 _EYES = np.array([[x, y, 0.55] for x in (1.1, -1.1) for y in (-1.25, 1.25)])
-# The camera sees the surface obliquely: preferred cosine of the angle between the direction to the camera and the
-# surface normal.
+# Preferred cosine of the angle between the direction to the camera and the surface normal, for an oblique view.
 _SLANT = 0.35
 # Name, unit, and value of a curve at each frame.
 Curve = tuple[str, str, Array]

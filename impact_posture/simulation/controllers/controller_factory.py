@@ -361,5 +361,5 @@ def _without_stop(path: PosturePath) -> PosturePath:
 
 
 def _from_outside(name: str) -> str:
-    """Name a controller of another package and its entry point."""
+    """Return text that names a controller of another package and its entry point."""
     return f"controller '{name}' ({metadata.entry_points(group=GROUP)[name].value})"

@@ -109,7 +109,7 @@ class Driver:
 
 
 class RobustDriver(Driver):
-    """Impact-robust controller.  After :meth:`brace`, its posture task contains the impact-robust term."""
+    """Impact-robust controller.  After :meth:`brace`, the posture task contains the impact-robust term."""
 
     posture: ImpactRobustPosture
 

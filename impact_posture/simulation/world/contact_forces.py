@@ -8,8 +8,8 @@ import numpy as np
 
 from impact_posture.system.arrays import Array
 
-# ``_ROWS`` are the three constraint rows of a contact with friction.  ``_FIRST`` selects the first row, the only row
-# of a contact without friction.
+# ``_ROWS`` are the indices of the three constraint rows of a contact with friction.  The mask ``_FIRST`` selects the
+# first row, the only row of a contact without friction.
 _ROWS, _FIRST = np.arange(3), np.arange(3) == 0
 # Indices with which a cross product is computed: (a × b)ᵢ = a[_NEXT[i]] b[_LAST[i]] − a[_LAST[i]] b[_NEXT[i]].
 _NEXT, _LAST = [1, 2, 0], [2, 0, 1]

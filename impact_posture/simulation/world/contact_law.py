@@ -45,7 +45,7 @@ class ContactLaw(StrictTable):
         """Check that MuJoCo would not silently change a number."""
         a, b = self.solref
         if not ((a > 0 and b > 0) or (a < 0 and b <= 0)):
-            hint = "give a time and a damping ratio above zero, or both numbers below"
+            hint = "give a time and a damping ratio above zero, or two negative numbers"
             raise InputError(f"solref is {self.solref}", where="scene", hint=hint)
         low, high, width = self.solimp
         if not (0.0001 <= low <= high <= 0.9999 and width > 0):

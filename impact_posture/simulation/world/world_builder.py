@@ -35,7 +35,7 @@ from impact_posture.system.optional_package import import_mujoco
 
 # Joint families whose velocities have the same meaning in Pinocchio and MuJoCo.
 _DRIVEN = ("revolute", "continuous", "prismatic", "translation", "spherical")
-# Function from a unit normal to the lowest point of a shape against this normal, world, m.
+# Function from a unit normal to the point of a shape that is lowest along this normal, world, m.
 _Lowest = Callable[[Array], Array]
 
 

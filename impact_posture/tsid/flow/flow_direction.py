@@ -214,7 +214,7 @@ class FlowDirection:
         """Return the change of the tilt angle caused by a displacement, shape (nv,).
 
         ``along`` is the part of the base rotation about the tilt axis, rad.  A horizontal rotation perpendicular to
-        the tilt axis increases the tilt to second order.
+        the tilt axis increases the tilt only to second order.
         """
         turn = float(self._vertical @ displacement[3:6])
         aside = float(displacement[3:6] @ displacement[3:6]) - turn**2 - along**2

@@ -27,8 +27,8 @@ class Redundancy:
         basis: Orthonormal basis ``Z`` of the null space, shape (nv, r).
         inverse: Pseudo-inverse ``J⁺`` on the constrained directions, shape (nv, rows).
         springs: ``k JZ`` of nearly dependent constraints, which are springs of stiffness ``k``, shape (rows, r);
-            ``None`` without springs.
-        stiffness: Stiffness ``k s²`` of the springs along each column of ``Z``, shape (r,); ``None`` without springs.
+            ``None`` if there are no springs.
+        stiffness: Stiffness ``k s²`` of the springs along each column of ``Z``, shape (r,), or ``None``.
     """
 
     basis: Array
@@ -53,7 +53,7 @@ class Redundancy:
         return cls(Z, (Vt[:rank].T / s[:rank]) @ U[:, :rank].T, springs, stiffness)
 
     def project(self, vector: Array) -> Array:
-        """Return the projection of a vector, shape (nv,), onto the null space."""
+        """Return the projection of a vector, shape (nv,), onto the null space of the constraints."""
         return np.asarray(self.basis @ (self.basis.T @ vector))
 
     def back(self, rate: Array, base: int) -> Array:

@@ -64,7 +64,7 @@ class ReferenceFlow:
         acceleration: Acceleration ``u̇`` of ``q_r``, rad/s² (m/s²), shape (nv,).
         value: ``H(q_r)`` at the last update.
         start: ``H₀``, the absolute value of ``H`` at the reset.
-        on: Whether the flow may move.
+        on: Whether the flow is switched on.
         resting: Whether the flow rests because the predicted decrease of ``H`` is too small or its ``duration`` is
             over.
         failed: Whether the last evaluation raised an exception or was not finite; the flow then brakes.

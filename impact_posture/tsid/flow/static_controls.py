@@ -22,8 +22,8 @@ LEFT = 0.1
 EVEN = 0.6
 # If the direction of an edge is within this angle of −π, rad, the edge is sorted as if its direction were +π.
 _START = 1e-8
-# This fraction of the trace is added to the diagonal of the equations of the contact wrenches.  The equations are
-# then solvable even if the feet cannot carry every wrench on the base.
+# This fraction of the trace is added to the diagonal of the equations of the contact wrenches.  With this term, the
+# equations are solvable even if the feet cannot carry every wrench on the base.
 TINY = 1e-12
 
 

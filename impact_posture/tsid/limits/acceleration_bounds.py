@@ -50,7 +50,7 @@ class LimitLaw:
 
 
 class AccelerationBounds:
-    """Bounds that a :class:`LimitLaw` sets on the accelerations at each state.
+    """Bounds on the accelerations at a state, computed by a :class:`LimitLaw`.
 
     Attributes:
         lower: Lower bounds of the accelerations, rad/s² (m/s²), shape (nv,); minus infinity means no bound.

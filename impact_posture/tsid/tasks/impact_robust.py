@@ -77,7 +77,8 @@ class ImpactRobustPosture(JointPosture):
       ``λ``, ``K`` is a stiffness in 1/s² like ``K_p`` on every robot, although ``H`` scales with 1/armature².  Near
       an optimum with the curvature ``λ*``, the term is a spring with the stiffness ``K λ*/λ``.  This stiffness can be
       several times ``K``, because ``λ`` is the curvature at the start, where ``H`` may even be concave.
-    - By default, ``K_d = 2√(K_p + K)``.  If ``λ* = λ``, this is critical damping for the sum of both stiffnesses.
+    - By default, ``K_d = 2√(K_p + K)``.  If ``λ* = λ``, this damping is critical for the sum ``K_p + K`` of the
+      stiffnesses.
     - The length of the term is at most ``K·reach``, as for a spring with the stiffness ``K`` and the length
       ``reach``.  If this bound were below ``K_p|q_des ⊖ q|``, the robot would stop before the optimum.
     - ``s(q)`` fades out the part of the term that pushes a joint into a position limit.  The fade begins
@@ -280,8 +281,8 @@ def curvature_scale(gradient: Gradient, model: pin.Model, q: Array, redundancy: 
         MetricError: At ``q``, the gradient does not exist, or ``H`` and its curvature are zero.
     """
     Z = redundancy if redundancy.shape[1] else np.eye(model.nv)
-    # Take differences along the axes of ν.  Differences along a basis of the redundancy would have errors that depend
-    # on the basis.
+    # Take differences along the coordinate axes of ν.  Differences along a basis of the redundancy would have errors
+    # that depend on the basis.
     change = curvature(gradient, model, q, np.eye(model.nv))
     scale = max(float(np.linalg.norm(Z.T @ change @ Z, 2)), _FLAT * abs(gradient(q)[0]))
     if not (np.isfinite(scale) and scale > 0):
