@@ -202,7 +202,10 @@ def test_a_result_draws_and_exports_itself(result: ip.PostureResult, tmp_path: P
     assert controller.tick(0.0, q, v).status is ip.tsid.Status.SOLVED and slope.shape == (robot.nv,)
 
 
-def test_the_code_of_a_result_is_the_code_of_its_objective(result: ip.PostureResult, tmp_path: Path) -> None:
+def test_the_code_of_a_result_is_the_code_of_its_objective(
+    result: ip.PostureResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(plot, "drawable", lambda *_: [])
     result.save(tmp_path / "out", formats=("png",), report=False, jobs=1)
     folder = tmp_path / "out" / "c"
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
@@ -300,7 +303,8 @@ def test_value_and_gradient_equal_differences_and_the_oracle() -> None:
         objective.value_and_gradient([0.0])
 
 
-def test_the_friction_of_the_contact_is_saved(tmp_path: Path) -> None:
+def test_the_friction_of_the_contact_is_saved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(plot, "drawable", lambda *_: [])
     robot = ip.load_robot("tilthex_arm")
     objective = ip.ImpactObjective(robot, ip.ImpactContact("ee", (0, 0, 1), friction=0.3), kind="coulomb")
     problem = ip.PostureProblem(objective, base="level")

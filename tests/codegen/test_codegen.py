@@ -78,7 +78,10 @@ class Built:
     folder: Path
 
 
-@pytest.fixture(scope="module", params=list(CASES))
+LONG = ("solo8-standing", "kinova")
+
+
+@pytest.fixture(scope="module", params=[pytest.param(c, marks=pytest.mark.long if c in LONG else ()) for c in CASES])
 def built(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Built]:
     need_compiler()
     objective = CASES[request.param].build()
@@ -220,6 +223,7 @@ def test_posture_is_a_constant(built: Built) -> None:
 
 
 # Two of the robots have code with SIMD vectors and comparisons; one robot has neither.
+@pytest.mark.long(but=("hextilt",))
 @pytest.mark.parametrize("built", ["solo12-standing", "hextilt"], indirect=True)
 def test_compiles_as_cpp(built: Built, tmp_path: Path) -> None:
     compiler = need("g++")

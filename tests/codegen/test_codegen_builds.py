@@ -109,6 +109,7 @@ def two(arm: WorstCaseObjective) -> tuple[WorstCaseObjective, WorstCaseObjective
 # ---- builds by users ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long(but=("double",))
 @pytest.mark.parametrize("real", [DOUBLE, FLOAT], ids=lambda r: r.name)
 def test_several_frames_in_one_library(two: tuple[WorstCaseObjective, ...], tmp_path: Path, real: Real) -> None:
     make = need("make")

@@ -131,6 +131,7 @@ def test_a_relaxed_tick_misses_its_levels_as_in_python(name: str) -> None:
     assert relaxed >= 3
 
 
+@pytest.mark.long(but=("solo8-base_link-release", "tilthex_arm-ee-keep", "tilthex_arm-ee-follow"))
 @pytest.mark.parametrize(
     ("name", "frame", "spring"),
     [("tilthex_arm", "ee", "keep"), ("tilthex_arm", "ee", "follow"), ("tilthex_arm", "ee", "release"),

@@ -87,7 +87,8 @@ def test_dates_of_builds_do_not_matter(date: str, arena: Path, monkeypatch: pyte
     assert os.environ["SOURCE_DATE_EPOCH"] == date
 
 
-def test_overflows_in_a_program_are_not_printed(arena: Path) -> None:
+def test_overflows_in_a_program_are_not_printed(arena: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(plot, "drawable", lambda *_: [])
     more = ("--regularization", "1e308", "--contact-pose", "free", "--starts", "1", "--no-codegen", "--no-report")
     outcome = strike(arena, "optimize", "small.urdf", *PUSH, *more, "--out", "out", "--compile", "never", "--quiet")
     assert outcome.complaints == [] and "CasADi" not in outcome.err, outcome.err

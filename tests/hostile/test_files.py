@@ -1,6 +1,6 @@
 """Damaged input files give a one-line error that names the file, and other files stay intact.
 
-``--hostile-full`` tries twenty times as many files.
+``--hostile-full`` tries forty times as many files.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from tests.hostile.values import TOML, spoiled
 
 PUSH = ("small.urdf", "--frame", "tip", "--normal", "0", "0", "1")
 STOP = ("--out", "precious", "--force")
-COUNT = 8
+COUNT = 4
 
 PROBLEM = """robot = "small.urdf"
 frame = "tip"
@@ -107,7 +107,7 @@ def test_spoiled_files(name: str, arena: Path, hostile_full: bool) -> None:
     def arrange(k: int) -> None:
         (arena / file).write_bytes(spoiled(text(), rng, values) if k else text().encode())
 
-    outcomes = attack([argv] * (COUNT * (20 if hostile_full else 1)), arena, arrange)
+    outcomes = attack([argv] * (COUNT * (40 if hostile_full else 1)), arena, arrange)
     assert outcomes[0].code == 0 or "holds thesis.txt" in outcomes[0].err, outcomes[0].err
     assert any(outcome.code == 1 and file in outcome.err for outcome in outcomes[1:])
     assert (arena / "precious" / "thesis.txt").read_text() == "ten years"

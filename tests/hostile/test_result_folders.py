@@ -1,6 +1,6 @@
 """Damaged result folders give a one-line error that names the file, and other files stay intact.
 
-``--hostile-full`` tries twenty times as many folders.
+``--hostile-full`` tries forty times as many folders.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from tests.hostile.arena import attack, strike
 from tests.hostile.values import spoiled
 
 STOP = ("--out", "precious", "--force")
-COUNT = 8
+COUNT = 4
 
 
 def spoil_document(folder: Path, rng: random.Random) -> None:
@@ -165,6 +165,6 @@ def test_spoiled_results(
         if k:
             rng.choice(faults)(arena / "out", rng)
 
-    outcomes = attack([argv] * (COUNT * (20 if hostile_full else 1)), arena, arrange)
+    outcomes = attack([argv] * (COUNT * (40 if hostile_full else 1)), arena, arrange)
     assert outcomes[0].code == 0 or "holds thesis.txt" in outcomes[0].err, outcomes[0].err
     assert any(outcome.code == 1 and re.search(r"out[:/]", outcome.err) for outcome in outcomes[1:])

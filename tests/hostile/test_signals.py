@@ -105,6 +105,17 @@ def send(name: str, k: int, number: signal.Signals, folder: Path) -> None:
     assert not left, about
 
 
+@pytest.mark.long(
+    but=(
+        "optimize-1-SIGTERM",
+        "evaluate-0-SIGINT",
+        "codegen-0-SIGINT",
+        "simulate-1-SIGHUP",
+        "simulate-2-SIGINT",
+        "codegen-2-SIGTERM",
+        "optimize-2-SIGHUP",
+    )
+)
 @pytest.mark.parametrize(("name", "k", "number"), times(3), ids=lambda value: str(getattr(value, "name", value)))
 def test_a_signal_ends_everything(name: str, k: int, number: signal.Signals, tmp_path: Path) -> None:
     send(name, k, number, tmp_path)

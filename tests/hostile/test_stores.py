@@ -25,7 +25,7 @@ from impact_posture.experiment.reproduction import reproduce
 from tests.hostile.arena import judging, strike, write_short_scenario
 from tests.simulation.factories import needs_mujoco
 
-COUNT = 4
+COUNT = 2
 STORE = ".cmp.runs"
 COMPARE = ("compare", "short.toml", "--controllers", "nominal,invariant", "--seeds", "1", "--compile", "never")
 VALUES = (None, [], {}, "a", -1, 10**400, 1e308, float("nan"), [1.0], [[None]] * 3, True, "\0", "../../x", {"a": {}})
@@ -109,7 +109,7 @@ def spoil_entry(store: Path, rng: random.Random) -> None:
 def test_changed_stores(spoil: Any, finished: Path, hostile_full: bool) -> None:
     rng = random.Random(spoil.__name__)
     with judging() as judge:
-        for k in range(COUNT * (40 if hostile_full else 1)):
+        for k in range(COUNT * (80 if hostile_full else 1)):
             work = finished.parent / "work"
             shutil.rmtree(work, ignore_errors=True)
             shutil.copytree(finished, work)

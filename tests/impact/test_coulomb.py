@@ -90,6 +90,7 @@ def test_kinetic_energy_rises_with_friction_from_frictionless_to_sticking(seed: 
     assert np.all(np.diff(bounds) >= -1e-9 * bounds[-1])
 
 
+@pytest.mark.long(but=("solo8", "talos", "kinova", "tiago", "anymal_kinova", "borinot", "bolt", "ur5"))
 @pytest.mark.parametrize("name", SOME)
 def test_value_and_gradient_agree_three_ways(name: str) -> None:
     """Pinocchio, the symbolic kernel and finite differences agree for any friction, metric and supports."""

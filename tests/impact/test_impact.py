@@ -66,6 +66,7 @@ def describe(contact: ImpactContact, metric: Metric, supports: tuple[Support, ..
     return f"{metric.kind}, normal in {contact.normal_frame}, {len(supports)} supports"
 
 
+@pytest.mark.long(but=("solo8", "tilthex_arm", "kinova", "anymal_kinova", "bolt", "ur5", "borinot", "tiago"))
 @pytest.mark.parametrize("name", SOME)
 def test_symbolic_oracle_and_differences_agree(name: str) -> None:
     for loaded, contact, metric, supports in combinations(name):
@@ -138,6 +139,7 @@ def test_oracle_by_its_definition(name: str) -> None:
         assert_close(o.ellipsoid, ellipsoid, tolerance, f"ellipsoid ({where})")
 
 
+@pytest.mark.long(but=("solo8", "talos", "kinova", "bolt", "borinot"))
 @pytest.mark.parametrize("name", SOME)
 def test_lifted_form(name: str) -> None:
     """The initial guess is an isolated solution of the equations of the lifted form, and gives the oracle's value."""

@@ -341,15 +341,15 @@ def test_nothing_overlaps(name: str, figure: Any, request: pytest.FixtureRequest
 def test_files_in_all_formats_and_the_same_each_time(flying: RunView, fixed: RunView, tmp_path: Path) -> None:
     short = dataclasses.replace(fixed, windows=())
     paths = save_all(figures_of_run(short), tmp_path, ("svg",))
-    paths += save_all(figures_of_comparison([short, short]), tmp_path, ("pdf",))
+    paths += save_all(figures_of_comparison([short, short]), tmp_path / "comparison", ("svg",))
     paths += save(bars_figure(ROWS), tmp_path, "bars", FORMATS)
     assert [path.name for path in paths] == [
         "metric.svg", "controls.svg", "joints.svg", "snapshots.svg",
-        "comparison-metric.pdf", "comparison-controls.pdf", "comparison-joints.pdf", "snapshots.pdf",
+        "comparison-metric.svg", "comparison-controls.svg", "comparison-joints.svg", "snapshots.svg",
         "bars.png", "bars.svg", "bars.pdf",
     ]  # fmt: skip
     assert all(path.stat().st_size > 8_000 for path in paths)
-    again = save(bars_figure(ROWS), tmp_path / "again", "bars", ("svg", "pdf"))
+    again = save(bars_figure(ROWS), tmp_path / "again", "bars", ("pdf",))
     again += save(metric_figure(short), tmp_path / "again", "metric", ("svg",))
     for path in again:
         assert path.read_bytes() == (tmp_path / path.name).read_bytes()

@@ -55,7 +55,10 @@ def solved(name: str) -> PostureSolution:
     return solve(prepare(make_settings(CASES[name])).problem, starts=4, jobs=1)
 
 
-@pytest.fixture(params=CASES, scope="module")
+LONG = {"solo8 strike": pytest.mark.long}
+
+
+@pytest.fixture(params=[pytest.param(name, marks=LONG.get(name, ())) for name in CASES], scope="module")
 def moments(request: pytest.FixtureRequest) -> tuple[Robot, PosturePath, list[tuple[float, Array, Array, Array]]]:
     """A timed path, and its motion at ten instants between rows."""
     solution = solved(request.param)

@@ -211,6 +211,7 @@ def test_a_problem_that_cannot_be_screened_uses_random_starts() -> None:
     assert solution.estimate.method == "multistart" and solution.starts == 3
 
 
+@pytest.mark.long(but=("go2-normal0",))
 @pytest.mark.parametrize("robot, normal", [("go2", (-1, 0, 0)), ("hextilt", (0, 0, 1))])
 def test_collisions_and_loads_stay_excluded(robot: str, normal: tuple[float, float, float]) -> None:
     problem = prepare(make_settings({"robot": robot, "normal": normal, "collision": True, "holdable": True})).problem

@@ -225,6 +225,7 @@ def test_a_start_that_is_left_would_not_have_been_the_best(
     assert few.optima[0].hits <= all_.optima[0].hits
 
 
+@pytest.mark.long(but=("tilthex_arm",))
 @pytest.mark.parametrize("robot", ["solo8", "tilthex_arm"])
 def test_a_small_program_finishes_every_start(robot: str) -> None:
     solution = solve(prepare(ProblemSettings(robot=robot, normal=(0.0, 0.0, 1.0))).problem, compile="never")

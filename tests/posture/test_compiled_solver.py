@@ -39,6 +39,7 @@ def problem(prepared: Prepared) -> ConstrainedProblem:
     return prepared.problem
 
 
+@pytest.mark.long(but=("0",))
 @pytest.mark.parametrize("optimized", [compiled._OPTIMIZED, 0])
 def test_the_same_answer_from_machine_code(
     problem: ConstrainedProblem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, optimized: int

@@ -21,6 +21,7 @@ from tests.support.tools import need_compiler
 # ---- the C export -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long(but=("cone-real0",))
 @pytest.mark.parametrize(("kind", "real"), [("cone", DOUBLE), ("contacts", FLOAT)])
 def test_export_has_the_worst_model_variant(tmp_path: Path, kind: str, real: Real) -> None:
     need_compiler()

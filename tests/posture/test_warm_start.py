@@ -29,7 +29,9 @@ CASES = {
 Solved = tuple[PostureNLP, SolveRecord, float]
 
 
-@pytest.fixture(scope="module", params=CASES)
+@pytest.fixture(
+    scope="module", params=[pytest.param(c, marks=pytest.mark.long if c == "talos" else ()) for c in CASES]
+)
 def solved(request: pytest.FixtureRequest) -> Solved:
     """Return the program of a solved problem, with all rows that its optimum needs, and a run from this optimum."""
     settings = ProblemSettings(**{"robot": request.param, **CASES[request.param]})

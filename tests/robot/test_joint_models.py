@@ -124,6 +124,20 @@ def test_locked_joints_equal_a_model_without_them(name: str, kind: ObjectiveKind
         assert relative(mine.gradient(q)[kept], other.gradient(short)) < 1e-8
 
 
+@pytest.mark.long(
+    but=(
+        "impulse-euclidean-talos",
+        "sticking-kinetic-solo12",
+        "speed-kinetic-tilthex_arm",
+        "energy-euclidean-solo12",
+        "sticking-euclidean-panda",
+        "speed-euclidean-solo12",
+        "impulse-kinetic-panda",
+        "energy-kinetic-tilthex_arm",
+        "sticking-euclidean-tilthex_arm",
+        "energy-kinetic-panda",
+    )
+)
 @pytest.mark.parametrize("name", FRAMES)
 @pytest.mark.parametrize("metric", ["euclidean", "kinetic"])
 @pytest.mark.parametrize("kind", KINDS)

@@ -334,6 +334,7 @@ def test_a_felt_impact_sets_the_time_once() -> None:
     assert driver._at == 3.9
 
 
+@pytest.mark.long(but=("solo8-push",))
 @pytest.mark.parametrize("name", ["aerial-vertical", "solo8-push"])
 def test_away_from_the_impact_the_command_equals_nominal(name: str) -> None:
     factory, driver, nominal = shared_factory(name), invariant(name), shared_factory(name).driver("nominal")

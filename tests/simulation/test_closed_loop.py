@@ -37,6 +37,7 @@ def quiet(name: str) -> Setup:
     return set_up(replace(scenario, sensors=sensors, push=push))
 
 
+@pytest.mark.long(but=("aerial-vertical-1-0.001",))
 @pytest.mark.parametrize(("name", "leads", "band"), [("aerial-vertical", "1", 1e-3), ("solo8-push", "", 1e-6)])
 def test_the_program_agrees_with_simulate(name: str, leads: str, band: float, tmp_path: Path) -> None:
     need("g++")

@@ -31,6 +31,7 @@ def in_c(name: str, **options: Any) -> ControllerFactory:
     return replace(shared_factory(name), **{"compile": "always", "warnings": [], "_fault": "", **options})
 
 
+@pytest.mark.long(but=("solo8-push-robust-held",))
 @pytest.mark.parametrize(
     ("name", "controller", "mode"), [("solo8-push", "robust", "held"), ("aerial-vertical", "nominal", "live")]
 )

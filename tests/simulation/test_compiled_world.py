@@ -56,6 +56,7 @@ def assert_same(name: str, ours: Any, theirs: Any, ticks: int | None = None) -> 
         np.testing.assert_allclose(actual, wanted, rtol=0, atol=room, err_msg=f"{name}: {column}")
 
 
+@pytest.mark.long(but=("robust-held",))
 @pytest.mark.parametrize(("controller", "mode"), [("nominal", "live"), ("robust", "held"), ("robust-flow", "live")])
 def test_a_pushed_robot_moves_as_in_python(controller: str, mode: Any, in_python: Any) -> None:
     factory = in_c(shared_factory("solo8-push"))

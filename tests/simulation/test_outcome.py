@@ -165,6 +165,7 @@ def test_a_run_ends_when_the_state_diverges(monkeypatch: pytest.MonkeyPatch) -> 
         assert measure(factory.setup, record).contacts == 0
 
 
+@pytest.mark.long(but=("robust",))
 @pytest.mark.parametrize("controller", ["nominal", "robust"])
 def test_a_hextilt_flies_and_touches_the_floor(controller: str) -> None:
     factory = controller_factory(set_up(read_scenario(HEXTILT)))

@@ -27,6 +27,7 @@ def _made(name: str) -> ControllerFactory:
     return factory
 
 
+@pytest.mark.long(but=("aerial-vertical",))
 @pytest.mark.parametrize("name", ["aerial-vertical", "solo8-push"])
 def test_the_robot_follows_the_path_to_its_end(name: str) -> None:
     factory = _made(name)

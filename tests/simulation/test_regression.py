@@ -20,6 +20,12 @@ Band = tuple[float, float]
 
 # Measured motion q of `nominal`: 0.280-0.309, 0.112-0.127, 0.409, 0.284.  Measured reductions of q: 74-75, 80-81,
 # 12.2, 52 %; of H: 97.8, 69, 2.2, 78 %.
+@pytest.mark.long(
+    but=(
+        "aerial-lateral-1.5-changes1-nominal1-reduction1-lowered1",
+        "solo8-push-1.5-changes2-nominal2-reduction2-lowered2",
+    )
+)
 @pytest.mark.parametrize(
     ("name", "settle", "changes", "nominal", "reduction", "lowered"),
     [

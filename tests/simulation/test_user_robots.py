@@ -164,6 +164,7 @@ def test_the_end_effector_task_can_leave_the_spin_or_orientation_free(folder: Pa
     assert spun > 0.05 and (tilted < 0.03 if pose == "aligned" else tilted > 0.05)
 
 
+@pytest.mark.long(but=("go2-30.0",))
 @pytest.mark.parametrize(("name", "force"), [("solo12", 6.5), ("go2", 30.0)])
 def test_another_standing_robot_is_pushed(folder: Path, name: str, force: float) -> None:
     factory = standing(folder, name, force)

@@ -107,6 +107,7 @@ def short(chosen: Draw) -> Setup:
     return set_up(replace(scenario, contacts=brief, surfaces=surfaces))
 
 
+@pytest.mark.long(but=("aerial-vertical", "talos-push"))
 @pytest.mark.parametrize("scenario", list(VARIATIONS))
 def test_a_variation_changes_one_thing(scenario: str) -> None:
     named = list(VARIATIONS[scenario])

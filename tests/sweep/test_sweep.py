@@ -317,6 +317,7 @@ def test_the_key_depends_on_files_of_the_robot_and_the_posture(tmp_path: Path) -
     assert keys[0] == keys[1] and len(set(keys)) == 3
 
 
+@pytest.mark.long(but=("beside optima",))
 @pytest.mark.parametrize("y", [[0.1], [0.0, 0.1]], ids=["alone", "beside optima"])
 def test_points_out_of_reach_are_infeasible_and_others_avoid_the_wall(tmp_path: Path, y: list[float]) -> None:
     """The first point is out of reach; for the other points, most starts end with a link in the wall."""

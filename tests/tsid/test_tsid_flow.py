@@ -154,6 +154,7 @@ def test_it_does_not_climb_where_it_turns_or_brakes(
     assert run.values[-1] < least and (run.rested < rested or rested == np.inf)
 
 
+@pytest.mark.long(but=("solo8",))
 @pytest.mark.parametrize("name", ["solo8", "talos"])
 def test_the_base_tilts_no_further_than_it_may(name: str) -> None:
     """The objective decreases as the base tilts about an axis between roll and pitch."""

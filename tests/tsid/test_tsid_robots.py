@@ -137,6 +137,7 @@ def test_a_push_at_a_standing_robot_enters_its_dynamics() -> None:
 # ---- phases of an impact -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.long(but=("tilthex_arm-strict-follow", "kinova-arm-release"))
 @pytest.mark.parametrize(
     ("name", "kind", "spring"),
     [("tilthex_arm", "strict", "keep"), ("tilthex_arm", "strict", "follow"), ("kinova", "arm", "release")],
@@ -199,6 +200,7 @@ def test_same_inputs_give_same_bits_under_every_formulation(name: str, kind: str
         assert np.array_equal(record(*controller), first)
 
 
+@pytest.mark.long
 def test_ticks_leave_no_memory_behind() -> None:
     """The course contains solved, relaxed and held ticks."""
     controller, _ = bracing("tilthex_arm", "strict")
@@ -228,6 +230,7 @@ def own_gradient(r: Robot, normal: tuple[float, float, float]) -> Gradient:
     return interpreted(WorstCaseObjective(r, ImpactContact(contact_frame(r), normal)))
 
 
+@pytest.mark.long(but=("panda",))
 @pytest.mark.parametrize("name", ["panda", "tiago"])
 def test_energy_never_grows(name: str) -> None:
     """With damping only, ``K H/λ + ½‖ν‖²`` decreases until ``∇H`` cannot move any joint."""
