@@ -166,6 +166,7 @@ def test_no_redundancy_is_said(tmp_path: Path) -> None:
     assert "no redundancy left" in done.stdout
 
 
+@pytest.mark.usefixtures("few_tries")
 def test_aerial_robot_that_cannot_hover_is_warned_about(tmp_path: Path) -> None:
     """Rotors limited to half of their speed cannot carry the weight; the result contains a warning about this."""
     from impact_posture_robots import DATA
@@ -181,6 +182,7 @@ def test_aerial_robot_that_cannot_hover_is_warned_about(tmp_path: Path) -> None:
     assert any("cannot hover" in warning for warning in json.loads(done.stdout)["warnings"])
 
 
+@pytest.mark.usefixtures("few_tries")
 def test_surface_and_locking_are_warned_about(tmp_path: Path) -> None:
     """If the normal points into the surface, the whole robot is behind the surface."""
     wrong = ("optimize", "tilthex_arm", "--normal", 0, 0, -1, "--json", *FAST)
@@ -307,6 +309,7 @@ def test_what_holds_the_posture_is_told(tmp_path: Path) -> None:
     assert json.loads(again.stdout)["optimal"]["holding"]["other_loads"][0]["load"] == "while it pushes with 3 N"
 
 
+@pytest.mark.usefixtures("few_tries")
 def test_a_force_that_cannot_be_held_is_named(tmp_path: Path) -> None:
     asked = ("optimize", "panda", "--normal", 0, 0, 1, "--no-collision", *FAST, "--hold-force", 300)
     refused(run(*asked, cwd=tmp_path), 3, "torque of panda_joint6 while it pushes with 300 N")

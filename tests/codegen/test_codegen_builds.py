@@ -68,6 +68,14 @@ GRID = [
 ]
 
 
+@pytest.mark.long(
+    but=(
+        "weighted-speed-free-flyer-double-8 joints",
+        "euclidean-energy-free-flyer-float-4 joints",
+        "kinetic-impulse-free-flyer-float-8 joints",
+        "weighted-sticking-fixed-float-4 joints",
+    )
+)
 @pytest.mark.parametrize(
     ("metric", "kind", "root", "real", "joints"),
     GRID,

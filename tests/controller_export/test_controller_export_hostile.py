@@ -65,6 +65,7 @@ def test_contexts_in_threads_share_nothing(tmp_path: Path) -> None:
     assert ran.returncode == 0, ran.stdout + ran.stderr
 
 
+@pytest.mark.long(but=("tilthex_arm",))
 @pytest.mark.parametrize("name", ["panda", "tilthex_arm"])
 def test_ten_thousand_random_ticks_take_no_memory_and_stay_within_the_limits(name: str, tmp_path: Path) -> None:
     program = abuse_program(exported(name), tmp_path)

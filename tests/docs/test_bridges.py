@@ -279,6 +279,7 @@ def pairs(model: pin.Model, floating: bool) -> list[tuple[Vector, Vector]]:
     return [*states, (q, q)]
 
 
+@pytest.mark.long(but=("floating base, double",))
 @pytest.mark.parametrize(
     ("name", "frame", "real", "tolerance"),
     [("tilthex_arm", "ee", DOUBLE, 1e-10), ("panda", "panda_hand_tcp", FLOAT, 1e-4)],

@@ -106,7 +106,10 @@ def run_page(page: Path, folder: Path, long: bool = True) -> Iterator[Ran]:
 
 @pytest.mark.parametrize("page", [p for p in PAGES if p.is_file() and shown_commands(p)], ids=lambda p: p.stem)
 def test_shown_commands_run(page: Path, tmp_path: Path, request: pytest.FixtureRequest) -> None:
-    for ran in run_page(page, tmp_path, request.config.getoption("--long")):
+    long = request.config.getoption("--long")
+    if not long:
+        request.getfixturevalue("few_tries")
+    for ran in run_page(page, tmp_path, long):
         assert ran.code == ran.shown.code, f"{page.name}: exit code {ran.code}, not {ran.shown.code}: {ran}"
         assert "Traceback" not in ran.errors, f"{page.name}: {ran}"
         if "--json" in ran.shown.arguments:

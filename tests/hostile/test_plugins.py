@@ -104,7 +104,7 @@ def test_controllers_of_other_packages(
     figures = impact_posture.experiment.experiment_folders
     monkeypatch.setattr(figures, "figures_of_run", lambda views: {"snapshots": Figure(figsize=(1, 1))})
     write_short_scenario(arena)
-    chosen = range(len(evil)) if hostile_full else random.Random(3).sample(range(len(evil)), 12)
+    chosen = range(len(evil)) if hostile_full else random.Random(3).sample(range(len(evil)), 6)
     with judging() as judge:
         for k in chosen:
             shutil.rmtree(arena / "out", ignore_errors=True)

@@ -129,6 +129,7 @@ def test_soles_tip_over_their_edges() -> None:
 # ---- use as a constraint ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long(but=("solo12-base_link", "solo8-base_link"))
 @pytest.mark.parametrize(
     ("name", "frame"), [("solo12", "base_link"), ("solo8", "base_link"), ("talos", "torso_2_link")]
 )

@@ -82,6 +82,16 @@ def test_the_force_of_the_first_example_grows() -> None:
     assert np.sqrt(masses[1] / masses[0]) == pytest.approx(0.77, abs=0.02)
 
 
+@pytest.mark.long(
+    but=(
+        "world-0.0-panda",
+        "world-0.15-tilthex_arm",
+        "world-3.0-ur5",
+        "contact-0.0-tilthex_arm",
+        "contact-0.15-panda",
+        "contact-3.0-tilthex_arm",
+    )
+)
 @pytest.mark.parametrize("name", FRAMES)
 @pytest.mark.parametrize("friction", [0.0, 0.15, 3.0])
 @pytest.mark.parametrize("frame", ["world", "contact"])

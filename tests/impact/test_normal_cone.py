@@ -79,6 +79,9 @@ def pinocchio_form(name: str, frame: str, q: np.ndarray, kind: ObjectiveKind) ->
 # ---- comparison with samples --------------------------------------------------------------------------------------
 
 
+@pytest.mark.long(
+    but=("tilthex_arm-1.0", "tilthex_arm-80.0", "panda-20.0", "solo8-5.0", "solo8-80.0", "talos-1.0", "talos-45.0")
+)
 @pytest.mark.parametrize("degrees", ANGLES)
 @pytest.mark.parametrize("name", ROBOTS)
 def test_the_value_bounds_a_hundred_thousand_normals_closely(name: str, degrees: float) -> None:

@@ -139,6 +139,7 @@ def test_every_box(floating: bool, count: int, feet: int, metric: str, axes: str
         assert_close(objective.subgradients(q).gradients, [gradient], 1e-12, "one gradient", scale=value)
 
 
+@pytest.mark.long(but=("2-0-euclidean-contact", "2-1-kinetic-world", "3-0-weighted-world", "2-1-weighted-contact"))
 @pytest.mark.parametrize("axes", ["world", "contact"])
 @pytest.mark.parametrize(
     ("count", "feet", "metric"), [(2, 0, "euclidean"), (2, 1, "kinetic"), (3, 0, "weighted"), (2, 1, "weighted")]
@@ -294,6 +295,7 @@ def problem_of(task: dict[str, object], **more: object) -> ConstrainedProblem:
     return prepare(make_settings(task | more)).problem
 
 
+@pytest.mark.long(but=("two feet", "hand and elbow", "hand and elbow, free", "six"))
 @pytest.mark.parametrize("name", TASKS)
 def test_every_start_certifies(name: str) -> None:
     problem = problem_of(TASKS[name])

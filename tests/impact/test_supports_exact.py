@@ -172,6 +172,18 @@ def kernel_fun(name: str, relative_compliance: float) -> ca.Function:
     return ca.Function("kernel", [k.q, k.n], [k.H, k.grad_H, k.jump.a, k.G])
 
 
+@pytest.mark.long(
+    but=(
+        "solo8-straight-1e-09",
+        "solo8-equal knees-1e-06",
+        "solo8-one knee moved by 1e-6-1e-09",
+        "solo8-one knee moved by 1e-3-0.0001",
+        "solo8-random-1e-06",
+        "solo12-random-1e-09",
+        "bolt-random-0.0001",
+        "talos-random-1e-09",
+    )
+)
 @pytest.mark.parametrize(("name", "label", "relative_compliance"), STIFFENED)
 def test_the_kernel_loses_what_heavy_feet_must(name: str, label: str, relative_compliance: float) -> None:
     x = bounded(name, label, relative_compliance)
@@ -179,6 +191,7 @@ def test_the_kernel_loses_what_heavy_feet_must(name: str, label: str, relative_c
     heavy_feet(x, *[np.array(value).reshape(-1) if value.numel() > 1 else float(value) for value in out])
 
 
+@pytest.mark.long(but=("1e-09",))
 @pytest.mark.parametrize("relative_compliance", ENDS)
 def test_the_compiled_code_loses_no_more(tmp_path: Path, relative_compliance: float) -> None:
     written = objective("solo8", relative_compliance)
@@ -240,6 +253,7 @@ def test_the_limit_of_no_compliance_is_not_smooth() -> None:
 # ---- Pinocchio's impulse dynamics ---------------------------------------------------------------------------------
 
 
+@pytest.mark.long(but=("g1-2", "solo12-4", "anymal_c-4", "bolt-2"))
 @pytest.mark.parametrize(
     ("name", "count"),
     [("talos", 1), ("talos", 2), ("g1", 2), ("solo12", 4), ("go2", 4), ("anymal_c", 4), ("bolt", 2)],

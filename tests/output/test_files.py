@@ -50,6 +50,7 @@ def test_figures_are_written_in_all_formats(tilthex: ResultView, tmp_path: Path)
             assert content.startswith(b"%PDF") and b"/Type3" not in content and b"/CreationDate" not in content
 
 
+@pytest.mark.long
 def test_the_same_view_gives_the_same_files(pendulum: ResultView, tmp_path: Path) -> None:
     (first,) = draw_all(pendulum, tmp_path / "a", ("svg",), only=["ellipsoid"])
     (second,) = draw_all(pendulum, tmp_path / "b", ("svg",), only=["ellipsoid"])

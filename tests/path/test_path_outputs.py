@@ -39,6 +39,7 @@ def solved_path(**settings: object) -> tuple[Robot, PosturePath]:
     return solution.problem.robot, posture_path(solution, effort=500)
 
 
+@pytest.mark.long(but=("tilthex_arm",))
 @pytest.mark.parametrize(
     "settings",
     [{"robot": "tilthex_arm"}, {"robot": "kinova", "contact_pose": "position", "objective": "sticking"}],

@@ -164,6 +164,7 @@ def test_a_joint_that_is_held_does_not_move() -> None:
 # ---- the search ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_the_adaptive_search_reaches_what_sixteen_starts_miss() -> None:
     problem = random_arm(5)
     many = solve(problem, starts=200, seed=9, jobs=1, compile="never").optima[0].objective

@@ -62,6 +62,24 @@ def _random(robot: Robot, rng: np.random.Generator, size: float = 0.8) -> np.nda
     return pin.integrate(robot.model, pin.neutral(robot.model), rng.normal(size=robot.nv) * size)
 
 
+@pytest.mark.long(
+    but=(
+        "pose-talos",
+        "center of mass-talos",
+        "position-tilthex_arm",
+        "box-panda",
+        "orientation-kinova",
+        "axis-panda",
+        "pose-tilthex_arm",
+        "pose-kinova",
+        "pose, spin free-panda",
+        "turn-kinova",
+        "turn-tilthex_arm",
+        "center of mass-tilthex_arm",
+        "orientation-tilthex_arm",
+        "box-tilthex_arm",
+    )
+)
 @pytest.mark.parametrize("name", ROBOTS)
 @pytest.mark.parametrize("kind", FACTORIES)
 def test_constraint_agrees_with_itself_and_with_finite_differences(name: str, kind: str) -> None:

@@ -30,7 +30,8 @@ Solved = tuple[PostureNLP, SolveRecord, float]
 
 
 @pytest.fixture(
-    scope="module", params=[pytest.param(c, marks=pytest.mark.long if c == "talos" else ()) for c in CASES]
+    scope="module",
+    params=[pytest.param(c, marks=pytest.mark.long if c in ("anymal_kinova", "talos") else ()) for c in CASES],
 )
 def solved(request: pytest.FixtureRequest) -> Solved:
     """Return the program of a solved problem, with all rows that its optimum needs, and a run from this optimum."""

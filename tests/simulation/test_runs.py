@@ -122,6 +122,7 @@ def test_a_run_does_not_depend_on_the_other_sign() -> None:
 # ---- reproducible runs --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long(but=("solo8-push",))
 @pytest.mark.parametrize("name", ["aerial-vertical", "solo8-push"])
 def test_the_seed_determines_a_run(name: str) -> None:
     setup, first = shared_factory(name).setup, lived(name, "robust", "live", None)

@@ -21,6 +21,7 @@ from tests.support.helpers import assert_close, rng, unit
 pytest.importorskip("mujoco")
 
 
+@pytest.mark.long(but=("10000.0-talos arm", "1000000.0-panda", "10000.0-own arm"))
 @pytest.mark.parametrize("name", list(STUDIED))
 @pytest.mark.parametrize("stiffness", [1e4, 1e6])
 def test_mujoco_finds_the_same(name: str, stiffness: float) -> None:

@@ -77,6 +77,7 @@ def assert_all_there(report: VerificationReport) -> None:
 # ---- agreement ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long(but=("tilthex_arm", "panda"))
 @pytest.mark.parametrize("name", ["solo8", "tilthex_arm", "panda"])
 def test_known_robots_pass(name: str) -> None:
     assert_all_there(verify(objective(name), samples=2))
