@@ -68,6 +68,8 @@ def optimize(
         from impact_posture.path.strike import check_strike
 
         check_strike(prepared.problem, prepared.impact.speed)
+    if not no_codegen:
+        prepared.impact.objective.check_expressions()
     folder = Path(out) if out else default_out(prepared)
     check_output(folder, force=force, kind="result")
     # Check before the search that TOML allows all names, so that the result can be written afterwards.

@@ -99,7 +99,8 @@ def struck(case: str, name: str, seed: int, offline: Callable[..., OfflinePostur
 def results(case: str, name: str, seeds: range) -> list[dict[str, Any]]:
     """Return the results of all seeds.
 
-    The optimum is computed once, but for falls once for each seed, because the seed changes the height of a fall.
+    The optimum is computed once, for the speed of the first seed, but for falls once for each seed, because the seed
+    changes the height of a fall.
     """
     first: list[OfflinePosture] = []
 

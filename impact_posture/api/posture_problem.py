@@ -68,7 +68,7 @@ class PostureProblem:
             values["speed"] = speed
         if isinstance(objective, WorstCaseObjective):
             values |= {"objective": getattr(objective, "_stated_kind", objective.kind)}
-            values |= {"normal_cone": objective.normal_cone_deg}
+            values |= {"normal_cone": objective.normal_cone_deg, "bilateral": objective.bilateral}
             if stated(objective.contact.friction):
                 values["friction"] = objective.contact.friction
         for name in _OF_THE_OBJECTIVE & set(task):

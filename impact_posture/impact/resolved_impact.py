@@ -83,16 +83,20 @@ def resolve(settings: ImpactSettings, robot: Robot | None = None) -> ResolvedImp
 def choose_objective(settings: ImpactSettings, *, several: bool) -> tuple[ObjectiveKind, str]:
     """Return the objective type, and the reason if it is chosen automatically (otherwise empty)."""
     stated = [name for name in _CHOOSING if is_stated(getattr(settings, name))]
+    together = several and getattr(settings, "strike", False) and not settings.bilateral
+    stated += ["strike"] if together else []
     if settings.objective is None and not stated:
         return "impulse", ""
     if settings.objective is not None and settings.objective != "auto":
         return settings.objective, ""
-    kind, reason = _automatic(settings, several=several)
+    kind, reason = _automatic(settings, several=several, together=together)
     given = ", ".join(f"`{name}`" for name in stated)
     return kind, reason if settings.objective == "auto" else f"{reason} (auto, because of {given})"
 
 
-def _automatic(settings: ImpactSettings, *, several: bool) -> tuple[ObjectiveKind, str]:
+def _automatic(settings: ImpactSettings, *, several: bool, together: bool) -> tuple[ObjectiveKind, str]:
+    if together:
+        return "sticking", "objective sticking: the contacts strike together, all with the same speed"
     if several:
         return "impulse", "objective impulse: for several contacts at once, only bounds on the impulses are known"
     if settings.speed == 0:

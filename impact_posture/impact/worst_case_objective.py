@@ -162,6 +162,12 @@ class WorstCaseObjective:
             return ImpulseBox(oracles, self.bilateral) if self.impact_kind.adds_up else SimultaneousImpact(oracles)
         return self.normal_cone or self.impact_kind
 
+    def check_expressions(self) -> None:
+        """Raise ``MetricError`` if the objective has values, but no expressions for C code and batches."""
+        for member in self.by_variant:
+            if isinstance(member.worst_case, SimultaneousImpact):
+                member.worst_case.check_independent()
+
     @cached_property
     def normal_cone(self) -> NormalCone | None:
         """Worst case over the cone around the normal of the first contact; ``None`` if there is no cone."""

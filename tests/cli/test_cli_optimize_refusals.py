@@ -47,6 +47,10 @@ NAMES = '{"joint_names": ["shoulder_roll", "shoulder_pitch", "elbow_pitch"], "q"
             ("elbow", "above zero"),
         ),
         ("two.urdf", URDF, ("two.urdf", "--frame", "b", "--normal", 1, 0, 0), ("two.urdf", "'b'", "triangle")),
+        (
+            "p.toml", 'robot="panda"\ncontact=["panda_hand_tcp:0,0,1", "panda_hand:0,0,1"]\nobjective="sticking"',
+            ("p.toml",), ("objective sticking: the velocities of the contact points", "(--no-codegen)"),
+        ),
         ("x.urdf", "solid stl", ("x.urdf", "--frame", "b", "--normal", 1, 0, 0), ("x.urdf", "not XML")),
     ],
 )  # fmt: skip

@@ -209,6 +209,9 @@ def test_a_simultaneous_impact_of_points_on_one_link_is_not_exported() -> None:
     assert objective.value(loaded.posture()) > 0
     with pytest.raises(MetricError, match="depend on each other"):
         objective.gradient_fun()
+    task = {"robot": "panda", "contact": ("panda_hand_tcp:0,0,1", "panda_hand:0,0,1"), "objective": "sticking"}
+    problem = prepare(make_settings(task)).problem
+    assert solve(problem, starts=1, jobs=1, screened=16).estimate.method == "multistart"
 
 
 @pytest.mark.parametrize("feet", [(), ("HL_FOOT", "HR_FOOT")])

@@ -250,6 +250,12 @@ def test_auto_chooses_an_objective_and_gives_the_reason(more: dict[str, object],
 def test_several_contacts_come_at_once() -> None:
     task = {"robot": "talos", "contact": ("gripper_right_base_link:-1,0,0", "gripper_left_base_link:-1,0,0")}
     assert resolve(make_settings(task | {"objective": "auto"})).objective.kind == "impulse"
+    strikes = {"path": True, "strike": True}
+    pulled = strikes | {"bilateral": True}
+    for more, kind in ((strikes, "sticking"), (pulled, "impulse"), ({"speed": 1.0}, "impulse")):
+        impact = resolve(make_settings(task | more))
+        assert impact.objective.kind == kind
+        assert ("strike together" in impact.choice) == (kind == "sticking")
     impact = resolve(make_settings(task))
     known = impact.evaluate()
     line = verdict(impact, known, known).line

@@ -70,17 +70,20 @@ class SimultaneousImpact:
                 gradient = gradient - 2 * oracle.numeric.turning_gradient(oracle.point, oracle.n, r_i)
         return Subgradients(np.asarray(gradient)[None, :], np.zeros(1))
 
-    def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
-        """Return value and gradient.
+    def check_independent(self) -> None:
+        """Raise ``MetricError`` if the velocities of the contact points depend on each other.
 
-        Raises:
-            MetricError: The velocities of the contact points depend on each other, for example on one rigid link.
+        An example are points on one rigid link.  The impulses are then not unique, so :meth:`expressions` does not
+        exist.
         """
         if self._held(self.oracle.robot.posture()).outside.size:
             what = "the velocities of the contact points depend on each other, so C code cannot compute S"
-            raise MetricError(
-                what, where="objective sticking", hint="give one contact per link, or leave out the C code"
-            )
+            hint = "give one contact per link, or leave out the C code (--no-codegen)"
+            raise MetricError(what, where="objective sticking", hint=hint)
+
+    def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
+        """Return value and gradient.  Raise the error of :meth:`check_independent`."""
+        self.check_independent()
 
         def pushed(impulses: ca.SX) -> list[Wrench]:
             parts = ca.vertsplit(impulses, 3)

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from impact_posture.errors import MetricError
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.posture.constraints.constraint import ExpressionConstraint
 from impact_posture.posture.manifold.batch_descent import BatchDescent, Ends
@@ -93,8 +94,14 @@ class Screening:
 
 
 def screenable(problem: ConstrainedProblem) -> bool:
-    """Return whether the objective is an impact objective without a regularization."""
-    return isinstance(problem.objective, WorstCaseObjective) and not problem.requirements.regularization
+    """Return whether the objective is an impact objective with expressions, without a regularization."""
+    if not isinstance(problem.objective, WorstCaseObjective) or problem.requirements.regularization:
+        return False
+    try:
+        problem.objective.check_expressions()
+    except MetricError:
+        return False
+    return True
 
 
 def screen(problem: ConstrainedProblem, initial: Array, most: int, seed: int) -> Screening:
