@@ -61,9 +61,9 @@ def fitting_arrays(
     Args:
         arrays: Arrays of a file.
         prefix: First characters of the names in the file.
-        shapes: Name → kind of the numbers and names of the dimensions, such as ``"real n nq"``.  Equal names of
-            dimensions have equal sizes.  The kinds are ``real`` (finite), ``float`` (also NaN or inf), ``bool``,
-            and ``index``, an index along the dimension ``n``.
+        shapes: Name → kind of the numbers and names of the dimensions, such as ``"real n nq"``.  Dimensions
+            with the same name must have the same size.  The kinds are ``real`` (finite), ``float`` (also
+            NaN or inf), ``bool``, and ``index``, an index along the dimension ``n``.
         sizes: Known sizes of dimensions.
 
     Raises:

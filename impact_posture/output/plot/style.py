@@ -86,7 +86,7 @@ _RC: dict[str, Any] = {
 def style() -> Iterator[None]:
     """Use the matplotlib settings of this package within the block, and restore the previous settings afterwards."""
     with matplotlib.rc_context(), warnings.catch_warnings():
-        # Ignore the warning about missing letters, because matplotlib draws a box instead of the letter.
+        # If a font lacks a letter, matplotlib draws a box and warns.  The box is enough, so the warning is ignored.
         warnings.filterwarnings("ignore", "Glyph .* missing from font")
         matplotlib.rcdefaults()
         matplotlib.rcParams.update(_RC)

@@ -129,7 +129,7 @@ class ImpactRobustPosture(JointPosture):
             target: Target posture ``q_des``, shape (nq,); by default, the posture at ``reset``.
             K: Gain, 1/s².
             name: Name in reports.
-            spring: ``keep``, ``release`` or ``follow``.
+            spring: Mode of ``K_p`` and ``q_des`` while the term is on: ``keep``, ``release`` or ``follow``.
             follow: Time constant of ``spring = "follow"``, s.
             reach: Largest length of the term, divided by ``K``, rad.
             fade: Two distances from a position limit between which the term fades out, rad (m).

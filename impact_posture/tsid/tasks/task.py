@@ -18,8 +18,8 @@ from impact_posture.tsid.state import State
 
 Target = TypeVar("Target")
 
-# Time step of central differences along the motion, s.  Truncation and rounding errors are far below the tolerance of
-# the QP solver.
+# Time step of central differences along the motion, s.  With this step, the errors of the differences are far below
+# the tolerance of the QP solver.
 _STEP = 1e-4
 
 
