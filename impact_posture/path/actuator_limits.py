@@ -13,7 +13,7 @@ from impact_posture.posture.constraints.requirements import Requirements
 from impact_posture.posture.loads.load_cases import load_cases
 from impact_posture.system.arrays import Array
 
-# If the rotors miss a base wrench by less than this share of the weight, the difference is ignored.
+# If the rotors miss a base wrench by less than this fraction of the weight, the difference is ignored.
 _UNREACHABLE = 1e-7
 
 
@@ -38,7 +38,8 @@ class ActuatorLimits:
     def __init__(self, objective: Objective, q: Array, requirements: Requirements) -> None:
         robot = objective.robot
         self._model, self._velocities = robot.model.copy(), robot.tangent_names
-        # During a motion, the rotors of motors turn with the joints, so the armature counts for every joint model.
+        # During a motion, the rotors of motors turn with the joints, so the armature is included for every joint
+        # model.
         self._model.armature = np.where(np.isfinite(robot.armature), robot.armature, 0.0)
         self._data = self._model.createData()
         self.rotors = bool(robot.floating and robot.spec.propulsion)
@@ -58,9 +59,9 @@ class ActuatorLimits:
     def largest_rate(self, q: Array, rest: Array, dynamic: Array) -> float | None:
         """Return the largest ``λ ≥ 0`` for which the limits allow the load ``rest + λ dynamic``, or infinity.
 
-        A motion of duration ``T`` has the load of gravity plus ``1/T²`` times the dynamic load for ``T = 1 s``.  So
-        the result is ``1/T²``, where ``T`` is the duration of the fastest motion.  Return ``None`` if the limits do
-        not even allow the load at rest.
+        A motion of duration ``T`` has the load of gravity plus ``1/T²`` times the dynamic load for ``T = 1 s``.  The
+        largest ``λ`` is therefore ``1/T²``, where ``T`` is the duration of the fastest motion.  Return ``None`` if
+        the limits do not even allow the load at rest.
         """
         if self._out_of_reach(rest):
             return None
@@ -75,7 +76,7 @@ class ActuatorLimits:
         return None if self._out_of_reach(load) else self._equilibrium.shares(q, load)
 
     def need(self, moment: Moment, speeds: Array, part: float = 1.0) -> Need:
-        """Return the largest share of a limit at ``q``, ``ν``, ``ν̇``; infinite if rotors or friction forbid them.
+        """Return the largest share of a limit at ``moment``; infinite if rotors or friction do not allow this motion.
 
         ``speeds`` are the velocity limits, shape (nv,).  Torques and thrusts may use only ``part`` of their ranges.
         """

@@ -30,11 +30,11 @@ from impact_posture.system.arrays import Array
 
 # Coefficients of restitution of the similar impacts.
 RESTITUTIONS = (0.0, 0.5)
-# Factors on the velocity before the similar impacts.
+# Factors that multiply the velocity before the impact, in the similar impacts.
 FACTORS = (0.8, 1.0, 1.2)
 # Number of normals on the edge of the cone.
 _EDGE = 4
-# Number of postures of a stop at which its distances are measured.
+# Number of postures of a stop at which distances are measured.
 _POSTURES = 12
 # Feet are on level ground if the heights of their corners differ by less than this value, m.
 _LEVEL = 1e-3
@@ -56,12 +56,12 @@ class FollowThrough:
     Attributes:
         velocity: Predicted generalized velocity after the impact, ``ν + Δν``, shape (nv,); ``ν`` if no impulse is
             known.
-        rows: The motion from this velocity to rest; ``None`` if it does not exist.
+        rows: The stop: the motion from ``velocity`` to rest; ``None`` if no stop exists.
         impacts: Number of considered impacts: the predicted impact, and all combinations of a restitution in
             :data:`RESTITUTIONS` (0 after a fall), a factor on the velocity in :data:`FACTORS`, and a normal (also on
             the edge of the cone of normals).
-        stopped: Number of these impacts after which a stop within the limits exists.
-        longest_s: Duration of the longest of these stops, s.
+        stopped: Number of the considered impacts after which a stop within the limits exists.
+        longest_s: Duration of the longest stop, s.
         joints: Least distance from a joint limit; ``None`` without limits.
         clearance: Least distance between links and other bodies minus the clearance; ``None`` without shapes.
         hindrance: What prevents a stop, and after which impact; empty if all stops exist.
@@ -80,7 +80,7 @@ class FollowThrough:
     center_of_pressure: Room | None = None
 
     def to_dict(self) -> dict[str, object]:
-        """Return JSON content, without the rows."""
+        """Return the fields as JSON content, without ``rows``."""
         duration = None if self.rows is None else float(self.rows.t[-1])
         content = {key: value for key, value in vars(self).items() if key != "rows"}
         return jsonable({"duration_s": duration, **content})  # type: ignore[no-any-return]
@@ -110,8 +110,9 @@ def follow_through(
     Held joints and feet are assumed not to move.  The velocity after the impact may exceed the limits.
 
     A robot that falls (:func:`~impact_posture.path.strike_spaces.falls_freely`) then stands on its contacts, and
-    ``limits`` are the limits of the standing robot (:func:`~impact_posture.path.strike_spaces.landed`).  If a foot
-    rebounds, its leg presses the foot onto the ground again.  So only plastic impacts are considered after a fall.
+    ``limits`` are the limits of the standing robot (:func:`~impact_posture.path.strike_spaces.landed`).  After a
+    fall, only plastic impacts are considered, because the leg of a foot that rebounds presses the foot onto the
+    ground again.
     """
     falls = falls_freely(problem)
     standing, restitutions = (landed(problem, q), (0.0,)) if falls else (problem, RESTITUTIONS)
@@ -167,10 +168,11 @@ class _Stop:
 def _stop(
     impact: str, spaces: StrikeSpaces, q: Array, velocity: Array, limits: ActuatorLimits, falls: bool
 ) -> _Stop | str:
-    """Return the shortest stop from a velocity, or why none exists.
+    """Return the shortest stop from a velocity, or the reason why no stop exists.
 
-    Per length of the curve, the normal velocities of the contact points are constant, so contact points rebound.  If
-    the robot falls, the velocity of its center of mass is constant instead, so the ground need not pull the feet.
+    Along the curve of the stop, the normal velocities of the contact points are proportional to its speed, so contact
+    points move away from their surfaces.  If the robot falls, the velocity of its center of mass is constant instead,
+    so the ground need not pull the feet.
     """
     if falls and limits.missing:
         return f"no stop exists, because {limits.missing}"
@@ -213,10 +215,10 @@ def _to_bodies(space: PathSpace, q: Array) -> tuple[float, str]:
 
 
 def _to_edges(problem: ConstrainedProblem, q: Array, limits: ActuatorLimits) -> Callable[[Moment], tuple[float, str]]:
-    """Return a function for the least distance of the center of pressure from an edge of the support polygon, m.
+    """Return the function that computes the least distance of the center of pressure from the edges of the feet, m.
 
-    The center of pressure is where the contact forces have no horizontal moment.  The result is infinity if the feet
-    do not span an area on level ground.
+    The center of pressure is where the contact forces have no horizontal moment.  The distance is infinite if the
+    feet do not span an area on level ground.
     """
     numeric, robot = Numeric(problem.robot.model).at(q), problem.robot
     points = [point_on(robot, foot.frame, corner) for foot in problem.objective.supports for corner in foot.corners]

@@ -24,15 +24,16 @@ if TYPE_CHECKING:
 DEVIATION = 1e-5
 # Largest number of times that the number of knots is doubled.  At a corner, each doubling halves the deviation.
 _DOUBLINGS = 7
-# Number of knots of the projected spline per knot of the spline.  Such a spline divides the deviation by about 8⁴.
+# Number of knots of the projected spline for each knot of the original spline.  Eight times as many knots divide the
+# deviation by about 8⁴.
 _FINER = 8
 # Step of central differences along the curve, whose length is 1.
 _STEP = 1e-5
 # A knot is a corner if the second derivative of the spline there exceeds this multiple of the median over the knots.
 _SHARP = 5.0
-# Number of parts between two knots for the check of limits, next to corners.
+# Number of parts into which the check of limits divides the interval between two knots next to a corner.
 _AT_CORNERS = 8
-# Number of these parts elsewhere.
+# Number of parts into which the check of limits divides every other interval between two knots.
 _BETWEEN = 2
 
 
@@ -74,7 +75,7 @@ class PathCurve:
 
     @property
     def places(self) -> Array:
-        """Values of ``s`` for the check of limits: knots and values between knots, closer together at corners."""
+        """Values of ``s`` at which limits are checked: knots and values between knots, closer together at corners."""
         parts = [
             np.linspace(a, b, _AT_CORNERS if corner else _BETWEEN, endpoint=False)
             for (a, b), corner in zip(pairwise(self.s), self.corners, strict=True)

@@ -26,9 +26,9 @@ _SHARES = ("at", "velocity", "torque", "thrust")
 # Fields of a path in result.json.
 _BLOCK = ("found", "reason", "method", "timing", "objective", "length", "max_violation")
 _BASE = ("x", "y", "z", "qx", "qy", "qz", "qw")
-# Larger numbers cannot be part of a path.
+# Largest number that a path may contain.
 _LARGEST = 1e9
-# The times of rows have 9 decimals, so two rows cannot be nearer to each other, s.
+# Least time between two rows, s, because the times of rows have 9 decimals.
 _SHORTEST = 0.5 * 10.0**-DIGITS
 # Numbers of a strike in result.json.
 _STRIKE = ("speed", "stated_speed", "run_up_s", "run_up_m", "contact_s", "share")
@@ -42,9 +42,9 @@ def write_path(folder: Path, robot: Robot, path: PosturePath) -> None:
     ``trajectory_msgs/JointTrajectory``.  Between two rows, a motion along the quintic polynomial through both rows
     respects the limits.
 
-    The last row of a path with a strike is the contact.  The column ``contact`` of the CSV is 1 there.  The NPZ
-    contains the time of the contact, ``contact``, and a comment in the YAML states it.  The files
-    ``follow_through.*`` contain the stop after the impact, whose first row is the contact.
+    The last row of a path with a strike is the contact.  In this row, the column ``contact`` of the CSV is 1.  The
+    NPZ contains the time of the contact as ``contact``, and the YAML in a comment.  The files ``follow_through.*``
+    contain the stop after the impact, whose first row is the contact.
     """
     use = {} if path.use is None else {name: getattr(path.use, name) for name in _SHARES}
     arrays = {"objective": path.objectives, **{f"share_{name}": values for name, values in use.items()}}

@@ -25,7 +25,7 @@ class PathPhase(IntEnum):
     FOLLOW_THROUGH = 4
     """The contact has happened: the references follow the stop after the impact."""
     HOLD = 5
-    """At rest at the end."""
+    """The robot rests at the end of the path."""
 
 
 class PathReference:
@@ -37,17 +37,18 @@ class PathReference:
     1. A measured force exceeds ``felt``.
     2. The contact point has less than the share ``stopped`` of its planned speed, both computed with the Jacobian at
        the planned contact.
-    3. The time ``late`` after the expected contact is over.
+    3. The contact is later than expected by the time ``late``.
 
-    Then the references follow the stop after the impact, from their posture at the contact, or from the measured
-    posture after the third event.  If the contact is early, the references have only a share of the planned velocity,
-    and the motion of the stop is scaled by the same share.  Exported controllers in C contain the same references
-    (:mod:`impact_posture.controller_export.path_source`).
+    Then the references follow the stop after the impact.  The stop starts from the reference posture at the contact,
+    or from the measured posture after the third event.  If the contact is early, the reference velocity is only a
+    fraction of the planned velocity, and the velocity of the stop is scaled by this fraction.  Exported controllers
+    in C contain the same references (:mod:`impact_posture.controller_export.path_source`).
 
     Attributes:
         path: The path.
         approach: Speed of the contact point towards the surface per generalized velocity, shape (nv,), at the end of
-            the path.  If the contact is not known, the entries are zero, and the second event never occurs.
+            the path.  If the contact is not known, the entries are zero, and the second event (see above) never
+            occurs.
         late: Longest time for which the references continue after the expected contact, s.
         felt: Force above which a contact is felt, N.
         stopped: The contact is noticed if the contact point has less than this share of its planned speed.
@@ -95,7 +96,7 @@ class PathReference:
             self._expected = max(contact, max(self._begin + self._until, self._now) + self._duration)
 
     def back(self, over: float) -> None:
-        """Return to the beginning of the run-up within ``over`` seconds, and wait there for :meth:`expect`.
+        """Return to the beginning of the run-up within ``over`` seconds, and wait there for a call of :meth:`expect`.
 
         Before the contact, the call has no effect.
         """

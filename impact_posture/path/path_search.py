@@ -18,9 +18,9 @@ EFFORT = 5000
 # the share ``_DETOUR``, shortcuts, which need more time, shorten the path first.
 _BENT, _DETOUR = 0.02, 0.2
 _SHORTCUTS = 24
-# Number of postures of each elastic band.
+# Number of postures of each elastic band (:func:`shortened`).
 _BANDS = (9, 17, 33)
-# Number of sweeps over a band.
+# Number of times that all postures of a band are moved.
 _SWEEPS = 12
 
 
@@ -40,7 +40,7 @@ class Connection:
 
 
 class _Tree:
-    """Tree of postures that walks reach from a root, with their tangent coordinates at the root."""
+    """Tree of the postures that walks from a root reach, with the tangent coordinates of postures at the root."""
 
     def __init__(self, space: PathSpace, root: Array) -> None:
         self._space = space
@@ -69,14 +69,14 @@ class _Tree:
 
 
 def connect(space: PathSpace, start: Array, target: Array, seed: int = 0, effort: int = EFFORT) -> Connection:
-    """Search for a path with two trees of walks, which grow from both ends towards each other and random postures.
+    """Search for a path with two trees of walks from both ends, which grow towards each other and random postures.
 
     The method is CBiRRT (Berenson et al. 2009).  The planners of OMPL 2.0 on projected state spaces stop at
     inequalities, while these walks slide along them.  On a planar arm beside discs, OMPL found 5 of 18 paths in the
     time in which these trees found 18.
 
     Both ends, shape (nq,), must be valid.  The search ends after ``effort`` postures pulled onto the constraints.
-    The limit is a count and not a time, so the result depends only on the seed.
+    The effort does not depend on time, so the result depends only on the seed.
     """
     rng, chart = np.random.default_rng(seed), space.projector.chart
     first, second = _Tree(space, start), _Tree(space, target)
@@ -99,9 +99,9 @@ def shortened(space: PathSpace, postures: Sequence[Array], seed: int = 0) -> lis
     """Return a shorter and smoother path between the same ends, by shortcuts and then an elastic band.
 
     A shortcut is a walk between two postures of the path that is shorter than the path between them.  The elastic
-    band moves each posture to the middle of its neighbors and pulls it onto the constraints.  Each further band has
-    more postures.  The result is the last band if its whole motion is valid.  An almost straight path does not
-    change.
+    band moves each posture to the middle of its neighbors and pulls it onto the constraints.  Several bands with more
+    and more postures are tried in turn, and the last band is returned if its whole motion is valid.  An almost
+    straight path does not change.
     """
     path, rng = list(postures), np.random.default_rng(seed)
     straight = space.distance(path[0], path[-1])

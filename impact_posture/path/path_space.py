@@ -23,7 +23,7 @@ CHECK_DISTANCE = 2e-2
 _SEPARATIONS = 5
 # Tangent length of a step along the constraints, rad mixed with m.
 STEP = 0.05
-# A step is stuck if it comes nearer to its target by less than this share of its length.
+# A step is stuck if it reduces the distance to the target by less than this fraction of the length of the step.
 _PROGRESS = 0.05
 # Largest ratio of the length of a step on the constraints to its planned length.  A longer step is a jump to another
 # branch of the constraints.
@@ -79,7 +79,7 @@ class PathSpace:
         return projected if self.valid(projected) else None
 
     def apart(self, q: Array) -> Array | None:
-        """Return a valid posture near ``q``, shape (nq,), where links or bodies may be too near; ``None`` if none is.
+        """Return a valid posture near ``q``, shape (nq,), at which bodies may be too near to each other, or ``None``.
 
         Linearized steps move the bodies apart, each by 1.25 times the violation of the clearance.
         """
@@ -101,16 +101,17 @@ class PathSpace:
         return None
 
     def size(self, step: Array) -> float:
-        """Return the size of a tangent step.  Between two successive checked postures, the size is at most 1.
+        """Return the size of a tangent step in units of the largest step between two successive checked postures.
 
-        The size is the larger of two ratios: the motion of a frame divided by :data:`CHECK_DISTANCE`, and the tangent
-        norm divided by two steps of a walk.  Without inequalities, only the second ratio counts.
+        The size is the larger of two ratios.  The first is the largest motion of a frame divided by
+        :data:`CHECK_DISTANCE`, and is omitted without inequalities.  The second is the tangent norm divided by twice
+        the length of a step, :data:`STEP`.
         """
         moved = float(self._reach @ np.abs(step)) / CHECK_DISTANCE if self._inequalities else 0.0
         return max(moved, float(np.linalg.norm(step)) / (_JUMP * STEP))
 
     def checks(self, step: Array) -> int:
-        """Return into how many parts a check divides a tangent step; on the constraints, a part may get longer."""
+        """Return the number of equal parts of a tangent step between checks; the constraints may lengthen a part."""
         return max(1, int(np.ceil(_JUMP * self.size(step) - 1e-9)))
 
     def clear(self, start: Array, end: Array) -> bool:
@@ -144,8 +145,8 @@ class PathSpace:
         """Return postures from ``start`` towards ``target`` along the constraints, until no step comes nearer.
 
         The last posture is ``target`` itself if the walk reaches it.  Inequalities deflect the steps, because the
-        postures are pulled onto them, too.  The walk also ends where it is longer than ``longest`` with the rest of
-        the way, as a tangent length.
+        postures are also pulled onto the inequalities.  The walk also ends if the tangent length of the walk and of
+        the remaining distance together exceed ``longest``.
         """
         path, walked = [start], 0.0
         while True:
@@ -180,8 +181,8 @@ class PathSpace:
 def lever_arms(chart: Chart, model: pin.Model) -> Array:
     """Return an upper bound on the motion of any frame per unit of each velocity entry, m/rad or 1, shape (nv,).
 
-    For a rotation, the bound is the length of the longest chain of placements from the joint to a frame behind it.
-    No frame is farther from the axis.  Sliding joints on the chain add their largest travel.
+    For a rotation, the bound is the length of the longest chain of placements from the joint to a frame behind the
+    joint, because no frame is farther from the joint axis.  Sliding joints on the chain add their largest travel.
     """
     depth = np.zeros(model.njoints)
     for frame in model.frames:

@@ -24,10 +24,10 @@ INSTANTS = 61
 _INVERSE = 2001
 # Velocity limit that is assumed for a joint without a velocity limit, rad/s or m/s.
 _DEFAULT_SPEED = 1.0
-# A limit is active if a motion needs more than this share of it.
+# A limit is active if a motion needs more than this share of the limit.
 _ACTIVE = 0.98
 _ONE_AXIS = ("revolute", "continuous", "prismatic")
-# A time-optimal motion is rejected if it needs more than this multiple of a limit.
+# A time-optimal motion is rejected if it needs more than this multiple of any limit.
 _EXCEEDED = 1.01
 # Coefficients of 6 τ⁵ − 15 τ⁴ + 10 τ³, highest power first.
 _SMOOTH = np.array([6.0, -15.0, 10.0, 0.0, 0.0, 0.0])
@@ -46,7 +46,7 @@ def time_optimal(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> 
     # The solver does not accept infinite limits.
     bound = np.where(np.isfinite(speed), speed, 1e6)
 
-    # TOPP-RA needs a torque for every joint; the torque of a joint without a limit is zero here.
+    # TOPP-RA needs a torque for every joint, so the torque of a joint without a limit is set to zero.
     count, limited = space.model.nv, len(limits.names)
 
     def used(z: Array, v: Array, a: Array) -> Array:
@@ -77,9 +77,9 @@ def scaled(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedC
     """Return the fastest motion of the form ``s(t) = 10 τ³ − 15 τ⁴ + 6 τ⁵``, ``τ = t/T``, within all known limits.
 
     The load of a motion is the load of gravity plus ``1/T²`` times a load that does not depend on ``T``.  So a linear
-    program gives the smallest ``T`` at each instant, and the motion takes the largest of these durations.  Some
-    instants are evenly spaced, others are at ``curve.places``, most of which are at corners.  If a curve has corners
-    and :func:`slowed` takes less time, the result is the slowed motion.
+    program gives the smallest ``T`` at each instant, and the motion takes the largest ``T`` of all instants.  The
+    instants are evenly spaced, with additional instants at ``curve.places``, most of which are at corners.  If a
+    curve has corners and :func:`slowed` takes less time, the result is the slowed motion.
     """
     fine, law = np.linspace(0.0, 1.0, _INVERSE), polynomial(_SMOOTH, 1.0)
     notes, tau = [], np.concatenate([np.linspace(0.0, 1.0, INSTANTS), np.interp(curve.places, law.at(fine)[0], fine)])
@@ -162,10 +162,10 @@ class LimitUse:
 
 
 def limit_use(space: PathSpace, motion: TimedCurve, limits: ActuatorLimits) -> LimitUse:
-    """Return the shares of the limits along a motion, at its rows and between them.
+    """Return the shares of the limits along a motion, at its rows and between rows.
 
-    Forces of feet and of more than six rotors are not unique.  The result uses the forces whose largest share of a
-    limit is smallest.
+    Forces of feet and of more than six rotors are not unique.  The function chooses the forces for which the largest
+    share of a limit is smallest.
     """
     robot, t = space.problem.robot, motion.instants
     moments = [motion.rows.at(time) for time in t]

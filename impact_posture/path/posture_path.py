@@ -32,12 +32,11 @@ _NOT_SMOOTH = "no smooth curve through the path satisfies the constraints"
 _EVERYWHERE = f"{USABLE:.0%} of the velocity limits, joint limits or other constraints in every posture of the search"
 # Largest number of optima to try, best first.
 _OPTIMA = 5
-# The path strikes in an optimum with a larger objective if its speed exceeds the greatest speed so far by this
-# factor.
+# The path strikes at the best optimum that allows at least the greatest speed divided by this factor.
 _FASTER = 1.02
-# A path below this tangent length counts as no motion, rad mixed with m.
+# A path with a tangent length below this value, rad mixed with m, is treated as no motion.
 _NO_MOTION = 1e-6
-# A relative reduction of the objective below this value counts as no reduction.
+# A relative reduction of the objective below this value is treated as no reduction.
 _NO_GAIN = 1e-6
 # Largest number of reached postures to evaluate if no optimum is reached.
 _MOST_VISITED = 400
@@ -45,7 +44,7 @@ _MOST_VISITED = 400
 
 @dataclass(frozen=True, eq=False)
 class PosturePath(RowInterpolation):
-    """A motion from the start to the optimum, or to the best reached posture.  Without motion, it has one row.
+    """A motion from the start to the optimum, or to the best reached posture; a robot that does not move has one row.
 
     Attributes:
         found: Whether the path ends at the optimum.
@@ -214,7 +213,7 @@ def _struck(
     seed: int,
     effort: int,
 ) -> PosturePath | str:
-    """Return a path that strikes an optimum with the stated speed, or else the greatest speed; or why none does."""
+    """Return a path that strikes at an optimum with the stated or the greatest speed, or why no path strikes."""
     # The program requires the greatest possible speed if no posture allows the stated speed.
     constraints = solution.problem.constraints if solution.problem.requirements.strike else ()
     required = min([speed, *(c.speed for c in constraints if isinstance(c, ApproachSpeed))])
@@ -234,7 +233,7 @@ def _struck(
                 best = k, *led
                 break
             failure = failure or led
-    # The way to a run-up takes longer to compute than the run-up, so slower strikes get a way only now.
+    # The path to a run-up takes longer to compute than the run-up, so it is computed for slower strikes only now.
     while slower and best is None:
         enough = max(run.strike.speed for _, run in slower) / _FASTER
         k, run = slower.pop(next(i for i, (_, run) in enumerate(slower) if run.strike.speed >= enough))
@@ -276,7 +275,7 @@ def _led(start: Array, run: RunUp, limits: ActuatorLimits, seed: int, effort: in
 
 
 def _still(space: PathSpace, q: Array, *reasons: str) -> PosturePath:
-    """Return the path of a robot that stays at its start; if the first reason is empty, the start is the optimum."""
+    """Return the path of a robot that does not move; the path ends at the optimum if the first reason is empty."""
     rest, value = np.zeros((1, space.model.nv)), float(space.problem.objective.value(q))
     return PosturePath(
         space.model, np.zeros(1), q[None], rest, rest, found=not reasons[0],
@@ -322,4 +321,4 @@ def _reached(solution: PostureSolution, space: PathSpace, seed: int, effort: int
     reason = f"no path to the optimum {f'exists at this contact pose ({proof})' if proof else unproved}; "
     if connection.path:
         return connection, f"{reason}the path ends at the best {end}"
-    return stay, f"{reason}nothing better than the start was reached"
+    return stay, f"{reason}no posture better than the start was reached"

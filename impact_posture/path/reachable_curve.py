@@ -1,7 +1,7 @@
 """Paths of a robot with one degree of freedom left, whose self-motion is a curve.
 
-The curve either leads to the optimum, or proves that no path exists.  In the second case, the optimum is on another
-component of the self-motion, or the constraints cut the curve in both directions.
+The curve either leads to the optimum, or proves that no path exists.  No path exists if the optimum is on another
+component of the self-motion, or if the constraints cut the curve in both directions.
 """
 
 from __future__ import annotations

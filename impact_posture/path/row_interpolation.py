@@ -10,7 +10,7 @@ import pinocchio as pin
 from impact_posture.path.time_law import DIGITS
 from impact_posture.system.arrays import Array
 
-# Name of the interpolation in files.
+# Name of this interpolation in files.
 INTERPOLATION = "quintic"
 
 # Posture, velocity and acceleration.
@@ -22,7 +22,7 @@ class RowInterpolation:
     """Motion through rows of positions, velocities and accelerations, by polynomials of degree 5 between the rows.
 
     The polynomial is the tangent vector from the earlier of the two rows to the posture.  For a joint of one axis,
-    its entry is the change of angle or travel since this row.
+    the entry of this vector is the change of angle or travel since the earlier row.
 
     Attributes:
         t: Times of the rows, s, shape (n,).
@@ -46,12 +46,12 @@ class RowInterpolation:
     def coefficients(self, k: int) -> Array:
         """Return the coefficients of ``u``, …, ``u⁵`` between rows ``k`` and ``k + 1``, shape (5, nv).
 
-        The polynomial gives the tangent coordinates at row ``k``, and ``u`` rises from 0 to 1.
+        The polynomial gives tangent coordinates at row ``k``; ``u`` rises from 0 at row ``k`` to 1 at row ``k + 1``.
         """
         start, end, h = self.q[k], self.q[k + 1], self.t[k + 1] - self.t[k]
         turn = pin.dDifference(self.model, start, end, pin.ARG1)
-        # The change of this matrix along the step is ignored.  It is of second order in the step, and zero for joints
-        # of one axis.
+        # The change of the matrix along the step is ignored, because it is of second order, and zero for joints of
+        # one axis.
         v, a = self.v[k] * h, self.a[k] * h**2
         gap = np.array(pin.difference(self.model, start, end)) - v - a / 2
         speed, bend = h * (turn @ self.v[k + 1]) - v - a, h**2 * (turn @ self.a[k + 1]) - a

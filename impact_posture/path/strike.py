@@ -26,16 +26,16 @@ from impact_posture.posture.program.certificate import linearized_limits
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem
 from impact_posture.system.arrays import Array, null_space
 
-# Weight of the squared velocities, relative to their limits, which are added to the largest relative velocity.
+# Weight of the sum of squared relative velocities ν_i/ν̄_i that is added to the largest relative velocity.
 _UNIQUE = 1e-4
 # Weight of a run-up beyond a bound (r in :func:`impact_velocity`), relative to the largest share of a velocity limit.
 _CROWDED = 100.0
-# If the curve of a run-up bends across an active bound at once, the robot comes from the inside of this bound, with
-# this share of the contact speed (rad/s or m/s).
+# If the curve of a run-up bends across an active bound, the robot approaches this bound from inside, with this share
+# of the contact speed (rad/s or m/s).
 _RATE = 0.02
 # An inequality or joint limit is active within this distance (m, rad, or the unit of the constraint).
 _ACTIVE = 1e-3
-# A contact velocity that the joints miss by more than this share cannot be reached.
+# A contact velocity is treated as unreachable if the joints miss it by more than this fraction.
 _MISSED = 1e-9
 # Number of bisections for the greatest speed.
 _STEPS = 7
@@ -97,8 +97,8 @@ def check_strike(problem: ConstrainedProblem, speed: float) -> None:
 def _room(space: PathSpace, q: Array) -> tuple[Array, Array, Array]:
     """Return rows ``g``, shape (m, nv), and distances, shape (m,), such that a step ``δ`` needs ``gᵀδ ≤`` distance.
 
-    A row is the gradient of an inequality or joint limit.  Also return whether a motion can come from the inside of
-    the bound, shape (m,).  No motion can come from there for a joint that does not move, or for a bound on a robot at
+    A row is the gradient of an inequality or joint limit.  Also return, for each bound, whether a motion can reach
+    the bound from inside, shape (m,).  This is false for a joint that does not move, and for a bound on a robot at
     rest.
     """
     model, problem = space.projector.numeric.at(q), space.problem
@@ -136,14 +136,14 @@ def _tipping(problem: ConstrainedProblem, model: Numeric) -> Array:
 def impact_velocity(
     spaces: StrikeSpaces, q: Array, speed: float, time: float, *, balanced: bool = True, inside: bool = False
 ) -> tuple[Array, float] | None:
-    """Return ``ν`` with ``Jν = −v n`` on the constraints of the run-up, and its largest share of a velocity limit.
+    """Return ``ν`` with ``Jν = −v n`` on the constraints of the run-up, and the largest ``|ν_i|/ν̄_i``.
 
     All contacts arrive with the same speed, each along its normal.  The velocity minimizes the largest of
     ``|ν_i|/ν̄_i`` and, if ``balanced``, of the shares of :func:`_tipping`, plus a small weight times ``Σ (ν_i/ν̄_i)²``
-    that makes it unique.  Entries without a limit count only in the sum, in rad/s or m/s.  If possible, ``q − νt`` is
-    within inequalities and joint limits to first order, where ``t`` is the ``time``, s.  If not, the violation,
-    relative to the distance from the bound, is as small as possible.  If ``inside``, the robot comes from the inside
-    of active bounds with :data:`_RATE`.  Return ``None`` if no velocity exists.
+    that makes it unique.  Entries without a limit are included only in the sum, in rad/s or m/s.  If possible,
+    ``q − νt`` is within inequalities and joint limits to first order, where ``t`` is the ``time``, s.  If this is
+    impossible, the violation relative to the distance from the bound is minimized.  If ``inside``, the robot
+    approaches active bounds from inside, with :data:`_RATE`.  Return ``None`` if no velocity exists.
     """
     robot = spaces.run_up.problem.robot
     limited = np.isfinite(robot.velocity_limits)
@@ -154,8 +154,8 @@ def impact_velocity(
     if np.abs(A @ least - b).max() > _MISSED * speed:
         return None
     N = null_space(A, 1e-9)
-    # The unknowns are z, s and r: ν/ν̄ = least + N z.  All shares are at most s, and the run-up needs at most r ≥ 1
-    # times the distance to a bound.
+    # The unknowns are z, s and r, with ν/ν̄ = least + N z.  All shares are at most s, and the run-up needs at most
+    # r ≥ 1 times the distance to a bound.
     single = np.eye(len(scale))[limited]
     tipping = _tipping(spaces.run_up.problem, Numeric(robot.model).at(q)) * scale
     shares = np.vstack([single, -single, *([tipping] if balanced else [])])
@@ -195,11 +195,11 @@ class RunUp:
 
 
 def run_up(problem: ConstrainedProblem, q: Array, speed: float, limits: ActuatorLimits) -> RunUp | str:
-    """Return the shortest run-up to the stated speed at ``q``, or to the greatest speed; or why none exists.
+    """Return the shortest run-up to the stated or else the greatest speed at ``q``, or why no run-up exists.
 
-    The contact frames turn only if there are too few joints to prevent it.  The capture point of a robot that stands
-    stays away from the edges of the feet, unless this bounds the speed.  If active bounds limit the speed, the robot
-    comes from the inside of these bounds.  A robot without support falls (:func:`_fall`).
+    The contact frames turn only if there are too few joints to prevent a turn.  The capture point of a robot that
+    stands stays away from the edges of the feet, unless this condition limits the speed.  If active bounds limit the
+    speed, the robot approaches these bounds from inside.  A robot without support falls (:func:`_fall`).
     """
     if falls_freely(problem):
         return _fall(problem, q, speed)
@@ -218,7 +218,7 @@ def run_up(problem: ConstrainedProblem, q: Array, speed: float, limits: Actuator
 
 
 def _fall(problem: ConstrainedProblem, q: Array, speed: float) -> RunUp | str:
-    """Return the free fall from rest onto level ground in the posture ``q``; or what is in the way.
+    """Return the free fall from rest onto level ground in the posture ``q``, or what prevents the fall.
 
     The joints are at rest, so ``J_i ν = −v n_i`` needs no share of a velocity limit.
     """

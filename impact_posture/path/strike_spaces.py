@@ -28,7 +28,8 @@ from impact_posture.posture.program.constrained_problem import ConstrainedProble
 from impact_posture.robot.robot_spec import Support
 from impact_posture.system.arrays import Array
 
-# After the impact, the contact point may be this far inside the surface, m, because it may slide along the surface.
+# Largest distance, m, of a contact point inside the surface after the impact, where the point may slide along the
+# surface.
 _PRESSED = 1e-4
 # Heights by which a contact point that is inside the surface is lifted before it is pulled onto the constraints, m.
 _HEIGHTS = (0.0, 5e-3, 2e-2)
@@ -65,9 +66,10 @@ class StrikeSpaces:
         normals: Normals of the m surfaces at ``q``, world axes, shape (m, 3).
         approach: Postures on the way to the run-up.  The orientations of the contact frames are held as at the
             optimum.  A robot that falls has no other held frames.
-        run_up: Postures of the run-up.  In addition, each contact point is on the normal through its place at ``q``.
-        rebound: Postures after the impact, which moves all frames except the feet.  The center of mass may leave the
-            feet while the robot moves, and the joint limits have no margin.
+        run_up: Postures of the run-up.  In addition, each contact point is on the normal through its position at
+            ``q``.
+        rebound: Postures after the impact, in which all frames except the feet may move.  The center of mass may
+            leave the feet while the robot moves, and the joint limits have no margin.
 
     Args:
         turns: Whether the contact frames may turn in the run-up.
@@ -85,7 +87,7 @@ class StrikeSpaces:
         for contact, pose in zip(problem.objective.contacts, (wanted.contact_pose, *wanted.other_poses), strict=True):
             poses.setdefault(contact.frame, pose)
         for pose in poses.values():
-            # The constraint on the position comes first.  A constraint on the tilt may follow.
+            # The first constraint of a contact is on the position; a second constraint may be on the tilt.
             position, *tilt = problem.constraints[end : end + 1 + pose.startswith("aligned:")]
             turned += [position.orientation, *tilt] if isinstance(position, HeldPose) else tilt
             end += 1 + len(tilt)
@@ -130,7 +132,7 @@ class StrikeSpaces:
     def begin(self, start: Array) -> Array | None:
         """Return a posture of ``approach`` near a posture ``start``, shape (nq,); ``None`` if none was reached.
 
-        The surface can be nearer than a contact point at the start, which then has to leave it.
+        A contact point can be inside the surface at ``start``, and must then first leave the surface.
         """
         if self.approach.valid(start):
             return start

@@ -16,8 +16,8 @@ from impact_posture.path.timed_curve import moment
 from impact_posture.posture.approach.attainable_speed import RUN_UP
 from impact_posture.system.arrays import Array
 
-# Lengths of a stroke, s, measured as the time at the velocity of the impact.  A longer length is tried only if the
-# shorter lengths do not suffice.
+# Lengths of the curve of a stroke, given as the time, s, that the curve would take at the velocity of the impact.  A
+# greater length is tried only if smaller lengths do not suffice.
 _LENGTHS = (0.1, 0.5, 1.5)
 # Tangent length between two knots of a stroke, rad mixed with m.
 _KNOTS = STEP / 2
@@ -27,11 +27,11 @@ _FARTHEST = 1.5
 _AT_REST = 1e-9
 # Least number of knots of a stroke.
 _LEAST = 8
-# Number of times that the length of a curve is halved at most, until its knots suffice.
+# Maximum number of times that the length of a curve is halved until its knots suffice.
 _HALVINGS = 3
 # A stroke ends where its velocity exceeds this multiple of ``u``, the velocity at the posture ``q``.
 _FASTER = 3.0
-# A stroke ends where inequalities or joint limits deflect a step by more than this share of its planned length.
+# A stroke ends where inequalities or joint limits deflect a step by more than this fraction of its planned length.
 _DEFLECTED = 0.01
 # Singular values below this share of the largest one are zero.
 _RANK = 1e-9
@@ -55,18 +55,18 @@ class Stroke:
     """A smooth curve on the constraints that passes a posture ``q`` with the velocity ``u``, before or after it.
 
     The curve follows ``dq/db = u + A⁺(q)(A(q₀)u − A(q)u)`` from ``q₀ = q``.  This velocity is the nearest to ``u``
-    with ``A(q) dq/db = A(q₀)u``.  ``b`` is the time at this velocity, s.
+    with ``A(q) dq/db = A(q₀)u``.  ``b`` is the time, s, for which the curve would take this velocity.
 
     Args:
         space: Postures that the curve may pass.
         q: Posture with the velocity ``u``, shapes (nq,) and (nv,).
         rows: Function that returns the matrix ``A``, shape (m, nv), for the model at a posture.
-        time: Length of the curve, as the largest ``b``, s.
+        time: Desired length of the curve, given as the largest ``b``, s.
         before: Whether the curve ends at ``q``, instead of beginning there.
 
     Attributes:
         curve: The curve; ``None`` if it is too short for a spline.
-        time: Length of the curve, which may be less than desired, s.
+        time: Actual length of the curve, as the largest ``b``, s.
         end: Why the curve is shorter than desired; empty if it is not.
     """
 
@@ -130,7 +130,7 @@ class Stroke:
     def need(self, limits: ActuatorLimits, duration: float, factor: float, stop: bool = False) -> Need:
         """Return the largest share of a limit at instants of a motion; ``stop`` ends at the first share above 1.
 
-        The velocity at ``q`` counts as permitted, because a velocity jump may exceed the limits.
+        The velocity at ``q`` is treated as permitted, because a velocity jump may exceed the limits.
         """
         assert self.curve is not None  # noqa: S101 (narrows a type)
         law, worst = self.law(duration, factor), Need(0.0, "")
@@ -186,7 +186,7 @@ def shortest_stroke(
     before: bool,
     factor: float = 1.0,
 ) -> tuple[Stroke, float | None]:
-    """Return a stroke and its shortest duration within the limits, s; ``None`` if it has none."""
+    """Return a stroke and its shortest duration within the limits, s; ``None`` if there is no such duration."""
     for time in _LENGTHS:
         stroke = Stroke(space, q, u, rows, time, before=before)
         duration = None if stroke.curve is None else stroke.shortest(limits, factor)

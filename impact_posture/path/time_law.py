@@ -18,7 +18,7 @@ RAMP = 2e-3
 _SHARE = 0.05
 # Decimals of a time in seconds, because the times of a ``JointTrajectory`` are whole nanoseconds.
 DIGITS = 9
-# A jump of ``s̈`` below this share of the largest jump needs no row of its own.
+# No row is placed at a jump of ``s̈`` that is below this fraction of the largest jump.
 _BEND = 0.02
 
 

@@ -25,8 +25,8 @@ BETWEEN = (0.2, 0.5, 0.8)
 _DIFFERENCE = 0.004
 # Largest number of times that an interval is divided.
 _CUTS = 10
-# For a load without a limit, the difference is relative to the largest value of this load, which counts as at least
-# this share of the largest load.
+# For a load without a limit, the difference is relative to the largest value of this load, or to this fraction of the
+# largest value of all loads if that is greater.
 _SMALL = 0.01
 
 Row = tuple[float, Moment]
@@ -66,8 +66,8 @@ def sampled(
 ) -> TimedCurve:
     """Return the motion along a curve with a time law.
 
-    The rows are at most :data:`SAMPLE_TIME` apart.  If the interpolation between two rows needs other loads than the
-    motion, the interval is divided, at a jump of ``s̈`` if it contains one.
+    The rows are at most :data:`SAMPLE_TIME` apart.  If the loads of the interpolation between two rows differ from
+    the loads of the motion, the interval is divided, preferably at a jump of ``s̈``.
     """
     step = min(SAMPLE_TIME, law.duration / (_LEAST_POINTS - 1))
     t = np.linspace(0.0, law.duration, int(np.ceil(law.duration / step - 1e-9)) + 1).round(DIGITS)
