@@ -244,7 +244,7 @@ class PostureResult:
         self, out: str | Path, formats: Sequence[str] = DEFAULT_FORMATS, only: Sequence[str] | None = None, *,
         force: bool = False,
     ) -> list[Path]:  # fmt: skip
-        """Draw the figures into a folder, and return their paths.  ``force`` permits to replace the user's files.
+        """Draw the figures into a folder, and return their paths; ``force`` also replaces files of the user.
 
         Raises:
             OutputError: A file of the user has the name of a figure, or the folder cannot be written.

@@ -19,8 +19,8 @@ from impact_posture.system.arrays import Array
 MOST_VERTICES = 40
 """Largest number of vertices of a hull, because every vertex adds a constraint to the optimization."""
 
-# Points are treated as flat if their extent in one direction is below this value (m).  Their hull is made twice as
-# thick as this.
+# Points are treated as flat if their extent in one direction is below this value (m).  The hull of flat points is
+# made twice as thick as this value.
 _THIN = 1e-4
 _REQUEST = coal.DistanceRequest(True)
 _REQUEST.gjk_tolerance = 1e-12

@@ -28,9 +28,9 @@ from impact_posture.posture.program.constrained_problem import ConstrainedProble
 from impact_posture.robot.support_polygon import polygon_edges
 from impact_posture.system.arrays import Array
 
-# Coefficients of restitution of the similar impacts.
+# Coefficients of restitution of the considered impacts (:attr:`FollowThrough.impacts`).
 RESTITUTIONS = (0.0, 0.5)
-# Factors that multiply the velocity before the impact, in the similar impacts.
+# Factors that multiply the velocity before the impact, for the considered impacts.
 FACTORS = (0.8, 1.0, 1.2)
 # Number of normals on the edge of the cone.
 _EDGE = 4

@@ -142,7 +142,7 @@ class PathSpace:
         return moved if self.clear(q, moved) else None
 
     def walk(self, start: Array, target: Array, longest: float = np.inf) -> list[Array]:
-        """Return postures from ``start`` towards ``target`` along the constraints, until no step comes nearer.
+        """Return postures along the constraints from ``start``, until no step comes nearer to ``target``.
 
         The last posture is ``target`` itself if the walk reaches it.  Inequalities deflect the steps, because the
         postures are also pulled onto the inequalities.  The walk also ends if the tangent length of the walk and of

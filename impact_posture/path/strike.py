@@ -54,7 +54,7 @@ class Strike(JsonBlock):
     Attributes:
         speed: Speed at which the contact point arrives at the surface, m/s.
         stated_speed: Stated speed, m/s.
-        run_up_s: Time at which the run-up or the fall begins, from rest, s.
+        run_up_s: Time at which the run-up or the fall begins, s.  The robot is then at rest.
         run_up_m: Length of the run-up along the normal, or height of the fall, m.
         contact_s: Time of the contact, s.
         velocity: Generalized velocity at the contact, shape (nv,).
@@ -125,7 +125,7 @@ def _tipping(problem: ConstrainedProblem, model: Numeric) -> Array:
     if over is None:
         return np.zeros((0, model.model.nv))
     beyond, jacobian = over.evaluate(model)
-    # If a bound without margin is active, the center of mass can be at the edge.
+    # The center of mass can be at an edge of the feet if the bound has no margin and is active.
     room = np.maximum(-beyond, _ACTIVE)
     feet = [point_on(problem.robot, s.frame, s.offset) for s in problem.objective.supports]
     height = model.center_of_mass()[0][2] - np.mean([model.placement(foot).translation[2] for foot in feet])

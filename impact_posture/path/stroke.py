@@ -52,7 +52,7 @@ _RISING, _FALLING = np.array([-1.0, 2.0, 0.0, 0.0, 0.0]), np.array([1.0, -2.0, 0
 
 
 class Stroke:
-    """A smooth curve on the constraints that passes a posture ``q`` with the velocity ``u``, before or after it.
+    """A smooth curve on the constraints that ends or begins at a posture ``q`` with the velocity ``u``.
 
     The curve follows ``dq/db = u + A⁺(q)(A(q₀)u − A(q)u)`` from ``q₀ = q``.  This velocity is the nearest to ``u``
     with ``A(q) dq/db = A(q₀)u``.  ``b`` is the time, s, for which the curve would take this velocity.

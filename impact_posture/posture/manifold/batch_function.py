@@ -2,8 +2,8 @@
 
 CasADi evaluates one posture after another.  For a batch, a loop in C runs each operation of the function on a block
 of postures.  For 512 postures, the loop takes about a twentieth of the time of CasADi.  Without a compiler, NumPy
-runs each operation on all postures, in about an eighth of the time.  CasADi, the loop in C and NumPy give equal
-results.
+runs each operation on all postures, in about an eighth of the time of CasADi.  CasADi, the loop in C and NumPy give
+equal results.
 """
 
 from __future__ import annotations

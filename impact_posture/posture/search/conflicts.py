@@ -30,7 +30,7 @@ _TRIES = 24
 # Maximum number of random postures from which the starts are chosen.  The postures farthest from all bodies often
 # lead to a feasible posture when arbitrary postures do not.
 _DRAWN = 200
-# Number of starts after which a conflict is confirmed that is known from a nearby target.  For panda in front of a
+# Number of starts that confirm a conflict that is known from a nearby target.  For panda in front of a
 # wall, two starts are needed to find a way around a body.
 _CONFIRMING = 4
 # Number of random postures that are drawn first.  These postures usually suffice, and drawing all ``_DRAWN`` postures

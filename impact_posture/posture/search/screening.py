@@ -39,9 +39,9 @@ _LEAST = 16
 # If less than this fraction of the first random postures reaches the equalities, the descents end at too similar
 # postures.  Descents then also begin from starts that satisfy all constraints.
 _REACHED = 0.4
-# Number of such starts.
+# Number of these additional starts.
 _FEASIBLE = 128
-# Largest number of descents from such starts, as a fraction of all allowed descents.
+# Largest number of descents from the additional starts, as a fraction of all allowed descents.
 _PART = 1 / 8
 # Share of the new descents that are hops.
 _HOPPING = 0.75
