@@ -23,8 +23,8 @@ from impact_posture.posture.manifold.constraint_manifold import ConstraintManifo
 from impact_posture.posture.program.posture_nlp import build_nlp
 from impact_posture.posture.search import screening as screening_module
 from impact_posture.posture.search.growing_search import run_start
-from impact_posture.posture.search.multistart import PostureSolution, solve
-from impact_posture.posture.search.screening import screen, screenable
+from impact_posture.posture.search.multistart import PostureSolution, _estimate, solve
+from impact_posture.posture.search.screening import Screening, screen, screenable
 from impact_posture.posture.search.unseen_optima import SAME_VALUE, SearchEstimate, hits_by_value
 from impact_posture.system import toolchain
 from tests.posture.test_self_motion import drawn
@@ -237,18 +237,47 @@ def test_feasible_starts_descend_where_few_random_postures_reach_the_equalities(
 
 
 @pytest.mark.parametrize(
-    "hits, best, line",
+    "hits, line",
     [
-        ([4, 1, 15], 4, "20 starts reached optima with 3 different objectives, the best hit 4 times; about 5.0 %"),
-        ([20], 20, "20 starts reached optima with one objective, the best hit 20 times; fewer than 15 %"),
-        ([1], 1, "1 start reached optima with one objective, the best hit once; about 100 %"),
+        ([4, 1, 15], "20 starts reached optima with 3 different objectives, the best hit 4 times; about 5.0 %"),
+        ([20], "20 starts reached optima with one objective, the best hit 20 times; fewer than 15 %"),
+        ([1], "1 start reached optima with one objective, the best hit once; about 100 %"),
     ],
 )
-def test_the_line_of_an_estimate(hits: list[int], best: int, line: str) -> None:
+def test_the_line_of_an_estimate(hits: list[int], line: str) -> None:
     end = " of further starts would lead to another objective"
-    assert SearchEstimate.of("multistart", hits, best).line == line + end
-    bound = SearchEstimate.of("multistart", hits, best, bound=True, partial=True).line
-    assert bound == line.replace("about", "at most about") + end + " if these starts ignore clearances and loads"
+    assert SearchEstimate.of("multistart", hits).line == line + end
+    bound = SearchEstimate.of("multistart", hits, bound=True, partial=True).line
+    early = line.replace("about", "at most about").replace("reached optima with", "ended at")
+    assert bound == early + end + " if these starts ignore clearances and loads"
+
+
+def test_given_postures_are_named_beside_the_starts() -> None:
+    line = SearchEstimate.of("adaptive", [2, 1, 1, 1], hops=3, bound=True, given=1).line
+    assert line.startswith(
+        "4 starts, 3 hops and the given posture ended at 4 different objectives, the best hit 2 times; at most about "
+    )
+
+
+def test_hits_of_guesses_that_one_optimum_attracts_are_added() -> None:
+    """Starts of the first and second group end at the same objective, and nothing solves the third group."""
+    # Two starts of the first group ended at other postures.  If they ignored clearances, their optimum is unknown.
+    for partial, optima, best in ((False, 3, 1 + 3 + 2 + 2), (True, 4, 1 + 3 + 2)):
+        screening = Screening((np.zeros(2),) * 3, (3, 4, 2), (0, 0, 1), (9, 2, 1), partial, hops=0)
+        estimate = _estimate([1.0, 1.0, 2.0, 1.001], 0, screening)
+        assert (estimate.optima, estimate.hits_of_best) == (optima, best)
+        assert (estimate.starts, estimate.given) == (12, 1)
+        assert estimate.unseen_share == pytest.approx(1 / 13)
+    several = _estimate([0.5, None, 0.5 + 1e-9, 0.6, 0.5], 1, None)
+    assert (several.optima, several.hits_of_best, several.starts) == (3, 3, 5)
+    assert several.line.startswith("5 starts ended at 3 different objectives, the best hit 3 times")
+
+
+@pytest.mark.parametrize("starts", [4, 40])
+def test_the_numbers_of_a_search_agree(starts: int) -> None:
+    estimate = solve(random_arm(3), screened=starts, jobs=1, compile="never").estimate
+    assert estimate.hits_of_best + estimate.optima - 1 <= estimate.starts + estimate.given
+    assert estimate.given == 1 and estimate.starts + estimate.hops <= starts
 
 
 def test_values_that_are_nearly_equal_are_one() -> None:
@@ -267,7 +296,7 @@ def test_the_share_bounds_independent_starts(number: int, monkeypatch: pytest.Mo
         return hits_by_value(values, hits)
 
     monkeypatch.setattr(screening_module, "hits_by_value", kept)
-    share = SearchEstimate.of("adaptive", screen(problem, problem.given, 1024, 0).values, 1).unseen_share
+    share = SearchEstimate.of("adaptive", screen(problem, problem.given, 1024, 0).values).unseen_share
     others = solve(problem, starts=100, seed=9, jobs=1, compile="never", finish_all=True).optima
     new = [o.hits for o in others if np.abs(merits[0] - np.log(o.objective)).min() > SAME_VALUE]
     # Three standard deviations of the share of 100 starts, which is at least 2 % here.
@@ -275,7 +304,7 @@ def test_the_share_bounds_independent_starts(number: int, monkeypatch: pytest.Mo
 
 
 def test_an_optimum_of_hops_has_no_hits() -> None:
-    estimate = SearchEstimate.of("adaptive", [0, 3, 2], 0, hops=9)
+    estimate = SearchEstimate.of("adaptive", [0, 3, 2], hops=9)
     assert estimate.line.startswith(
         "5 starts and 9 hops reached optima with 3 different objectives, the best reached by hops only; fewer than 60"
     )

@@ -24,7 +24,7 @@ from impact_posture.posture.program.constrained_problem import (
     equality_jacobian,
     rank,
 )
-from impact_posture.posture.search.multistart import Optimum, distinct, hits_of_best, solve
+from impact_posture.posture.search.multistart import distinct, solve
 from impact_posture.system.arrays import nonnegative_least_squares, null_space
 from tests.output.views import PENDULUM
 from tests.support.biped import biped
@@ -405,9 +405,3 @@ def test_an_option_replaces_equivalent_keys_of_the_file(text: str, over: dict, e
 def test_listed_weights_need_the_weighted_metric(tmp_path) -> None:
     with pytest.raises(InputError, match="metric is kinetic"):
         prepare(make_settings({"robot": "panda", "normal": (0, 0, 1), "metric": "kinetic", "weights": (1.0,) * 9}))
-
-
-def test_equal_optima_at_different_postures_count_together() -> None:
-    far, near = np.zeros(3), np.ones(3)
-    assert hits_of_best((Optimum(far, 0.5, 1), Optimum(near, 0.5 + 1e-9, 3), Optimum(near, 0.6, 9))) == 4
-    assert hits_of_best((Optimum(far, 0.5, 1), Optimum(near, 0.6, 9))) == 1

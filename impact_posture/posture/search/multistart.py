@@ -22,7 +22,7 @@ from impact_posture.posture.program.ipopt import one_blas_thread
 from impact_posture.posture.search.growing_search import GrowingSearch, Progress, SolverRun
 from impact_posture.posture.search.impact_notes import notes_on_impacts
 from impact_posture.posture.search.initial_posture import initial_objective, initial_posture
-from impact_posture.posture.search.screening import screen, screenable
+from impact_posture.posture.search.screening import Screening, screen, screenable
 from impact_posture.posture.search.singular_target import singular_target
 from impact_posture.posture.search.start_draws import StartDraws
 from impact_posture.posture.search.unseen_optima import SearchEstimate, hits_by_value
@@ -172,17 +172,9 @@ def solve(
     if touching:
         count = len(certified) - len(good)
         notes.append(f"{count} certified postures were left out, because original shapes touch there: {touching}")
-    dominated = sum(r.dominated for r in runs)
-    if screening is None:
-        relative = np.array([o.objective for o in optima]) / max(abs(optima[0].objective), 1e-300)
-        values = hits_by_value(relative, [o.hits for o in optima])
-        # The ends of the dominated starts are unknown, so each counts as an objective with one hit.
-        values += (1,) * dominated
-        estimate = SearchEstimate.of("multistart", values, hits_of_best(optima), bound=dominated > 0)
-    else:
-        # Descents stop early in flat valleys, so the estimated fraction of unseen optima is probably too high.
-        more = screening.hops, True, screening.partial
-        estimate = SearchEstimate.of("adaptive", screening.values, hits_of_best(optima), *more)
+    dominated, certain = sum(r.dominated for r in runs), {*map(id, good)}
+    ended = [run.objective if id(run) in certain else None for run in runs]
+    estimate = _estimate(ended, dominated, screening)
     if estimate.hits_of_best <= 1 and estimate.starts >= _MANY:
         notes.append("at most one start ended at the best optimum: more `starts` may find a better one")
     return PostureSolution(
@@ -256,13 +248,35 @@ def distinct(
     return tuple(optima)
 
 
-def hits_of_best(optima: Sequence[Optimum]) -> int:
-    """Return how many starts reached the best objective.
+def _estimate(ended: Sequence[float | None], dominated: int, screening: Screening | None) -> SearchEstimate:
+    """Estimate unseen optima from the objectives where the runs ended; ``None`` for runs without a result.
 
-    Only objectives are compared, because the final postures of starts on a flat optimum differ.
+    The last runs are those of the screened guesses.  IPOPT can bring guesses with different objectives to the same
+    optimum, so their hits are added.  The postures are not compared, because postures on a flat optimum differ.
     """
-    best = optima[0].objective
-    return sum(o.hits for o in optima if o.objective - best <= _SAME_OBJECTIVE * abs(best))
+    count = len(ended) - (0 if screening is None else len(screening.guesses))
+    ends, given = [(objective, 1) for objective in ended[:count] if objective is not None], 0
+    # The ends of the dominated starts are unknown, so each counts as an objective with one hit.
+    others = [1] * dominated
+    if screening is not None:
+        given, rest, best = len(ends), dict(enumerate(screening.values)), dict[int, float]()
+        for group, hits, objective in zip(screening.groups, screening.hits, ended[count:], strict=True):
+            if objective is not None:
+                ends.append((objective, hits))
+                rest[group] -= hits
+                best[group] = min(objective, best.get(group, np.inf))
+        if not screening.partial:
+            # Descents that ended at the objective of a guess, but at other postures, have the same objective.
+            ends += [(objective, rest.pop(group)) for group, objective in best.items()]
+        others = [hits for group, hits in rest.items() if hits or group not in best]
+    objectives, counts = zip(*ends, strict=True)
+    distinct_hits = hits_by_value(np.array(objectives) / max(abs(min(objectives)), 1e-300), counts)
+    if screening is None:
+        return SearchEstimate.of("multistart", [*distinct_hits, *others], bound=dominated > 0)
+    # Descents stop early in flat valleys, so the estimated fraction of unseen optima is probably too high.
+    return SearchEstimate.of(
+        "adaptive", [*distinct_hits, *others], screening.hops, bound=True, partial=screening.partial, given=given
+    )
 
 
 def wrapped_difference(problem: ConstrainedProblem, one: Array, other: Array) -> Array:

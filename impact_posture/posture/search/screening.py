@@ -23,7 +23,7 @@ from impact_posture.posture.manifold.constraint_manifold import ConstraintManifo
 from impact_posture.posture.manifold.feasible_start import FEASIBLE, Projector
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem
 from impact_posture.posture.search.start_draws import StartDraws
-from impact_posture.posture.search.unseen_optima import SAME_VALUE, hits_by_value
+from impact_posture.posture.search.unseen_optima import SAME_VALUE, groups_by_value, hits_by_value
 from impact_posture.system.arrays import Array
 
 # Number of descents that run together.  New descents begin when a quarter of these descents has ended.
@@ -81,6 +81,7 @@ class Screening:
     Attributes:
         guesses: Postures from which IPOPT starts, shape (nq,) each.
         hits: Number of random postures whose descents ended at each guess.
+        groups: Index in ``values`` of the objective of each guess.
         values: For each distinct objective where descents ended, best first: the number of random postures that
             descended to it.  The last entries are 1, each for a random posture whose descent got stuck.
         partial: Whether the problem has constraints that descents ignore, such as clearances.
@@ -88,6 +89,7 @@ class Screening:
 
     guesses: tuple[Array, ...]
     hits: tuple[int, ...]
+    groups: tuple[int, ...]
     values: tuple[int, ...]
     partial: bool
     hops: int
@@ -190,9 +192,9 @@ class _Search:
         # The ends of the stuck descents are unknown, so each counts as an objective with one hit.
         stuck = (1,) * int((self.descent.stuck == _RANDOM).sum())
         values = hits_by_value(self.ends.merit, self.ends.tag == _RANDOM) + stuck
-        return Screening(
-            tuple(guesses.values()), tuple(int(self._hits[k]) for k in guesses), values, partial, self._hops
-        )
+        hits, groups = tuple(int(self._hits[k]) for k in guesses), groups_by_value(self.ends.merit)
+        of_guesses = tuple(int(groups[self._end[k]]) for k in guesses)
+        return Screening(tuple(guesses.values()), hits, of_guesses, values, partial, self._hops)
 
     def _hop(self, other: Array) -> tuple[Array, NDArray[np.int_]]:
         """Return hops, shape (N, nx), and the descents that they start from; ``other`` are random postures."""

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from impact_posture.config.json_block import JsonBlock
 
@@ -23,14 +23,15 @@ class SearchEstimate(JsonBlock):
 
     Attributes:
         method: ``adaptive`` or ``multistart``.
-        starts: Number of starts at random postures, without hops.
+        starts: Number of starts, without hops; for ``adaptive`` without the given postures.
         hops: Number of starts at changed postures of the best optima.
-        optima: Number of distinct objectives that starts or hops reached.
-        hits_of_best: Number of starts that reached the best objective; 0 if only hops reached it.
+        optima: Number of distinct objectives at which starts, hops or given postures ended.
+        hits_of_best: Number of starts and given postures that reached the best objective; 0 if only hops reached it.
         unseen_share: Estimated share of further starts that would lead to an objective not seen yet.
         estimated_optima: Estimated number of objectives, seen and unseen.
         bound: Whether the share is probably too high, because some starts were stopped early.
         partial: Whether the starts ignored some constraints, such as clearances.
+        given: Number of given postures that count in addition to ``starts``.
     """
 
     method: str
@@ -42,15 +43,16 @@ class SearchEstimate(JsonBlock):
     estimated_optima: float
     bound: bool
     partial: bool
+    given: int = 0
     derived = ("line",)
 
     @staticmethod
     def of(
-        method: str, hits: Sequence[int], hits_of_best: int, hops: int = 0, bound: bool = False, partial: bool = False
+        method: str, hits: Sequence[int], hops: int = 0, bound: bool = False, partial: bool = False, given: int = 0
     ) -> SearchEstimate:
-        """Estimate from the number of starts at each objective that a start (not only a hop) reached."""
-        share, optima = unseen_share(hits), estimated_optima(hits)
-        return SearchEstimate(method, sum(hits), hops, len(hits), hits_of_best, share, optima, bound, partial)
+        """Estimate from the number of starts and given postures at each objective, the best objective first."""
+        share, optima, starts = unseen_share(hits), estimated_optima(hits), sum(hits) - given
+        return SearchEstimate(method, starts, hops, len(hits), hits[0], share, optima, bound, partial, given)
 
     @property
     def line(self) -> str:
@@ -60,10 +62,14 @@ class SearchEstimate(JsonBlock):
         most = min(1.0, _RULE_OF_THREE / max(self.starts, 1))
         near = "at most about" if self.bound else "about"
         elsewhere = f"{near} {_percent(self.unseen_share)}" if self.unseen_share else f"fewer than {_percent(most)}"
-        hops = f" and {self.hops} hops" if self.hops else ""
-        starts = "1 start" if self.starts == 1 else f"{self.starts} starts"
+        parts = ["1 start" if self.starts == 1 else f"{self.starts} starts"]
+        parts += [f"{self.hops} hops"] if self.hops else []
+        parts += ["the given posture" if self.given == 1 else f"{self.given} given postures"] if self.given else []
+        subject = " and ".join([", ".join(parts[:-1]), parts[-1]] if parts[1:] else parts)
+        # The end of a start that was stopped early is not an optimum.
+        ended = "ended at" if self.bound else "reached optima with"
         ignored = " if these starts ignore clearances and loads" if self.partial else ""
-        reached = f"{starts}{hops} reached optima with {optima}, the best {times}"
+        reached = f"{subject} {ended} {optima}, the best {times}"
         return f"{reached}; {elsewhere} of further starts would lead to another objective{ignored}"
 
 
@@ -71,19 +77,24 @@ def _percent(share: float) -> str:
     return f"{100 * share:.{0 if share >= 0.1 else 1}f} %"
 
 
-def hits_by_value(values: ArrayLike, hits: ArrayLike) -> tuple[int, ...]:
-    """Return the number of hits of each distinct value, the least value first.
+def groups_by_value(values: ArrayLike) -> NDArray[np.int_]:
+    """Return the index of the group of each value, shape (N,); the group with the least values is 0.
 
-    ``values`` and ``hits`` have shape (N,).  Values that exceed the least value of a group by at most
-    :data:`SAME_VALUE` belong to the group.
+    Values that exceed the least value of a group by at most :data:`SAME_VALUE` belong to the group.
     """
-    groups = list[tuple[float, int]]()
-    for value, count in sorted(zip(np.asarray(values, dtype=float), np.asarray(hits, dtype=int), strict=True)):
-        if groups and value <= groups[-1][0] + SAME_VALUE:
-            groups[-1] = groups[-1][0], groups[-1][1] + int(count)
-        else:
-            groups.append((value, int(count)))
-    return tuple(count for _, count in groups)
+    numbers, group, least = np.asarray(values, dtype=float), -1, -np.inf
+    groups = np.zeros(len(numbers), dtype=int)
+    for k in np.argsort(numbers):
+        if group < 0 or numbers[k] > least + SAME_VALUE:
+            group, least = group + 1, numbers[k]
+        groups[k] = group
+    return groups
+
+
+def hits_by_value(values: ArrayLike, hits: ArrayLike) -> tuple[int, ...]:
+    """Return the number of hits of each group of :func:`groups_by_value`; ``values`` and ``hits`` have shape (N,)."""
+    counts = np.bincount(groups_by_value(values), np.asarray(hits, dtype=int))
+    return tuple(counts.astype(int).tolist())
 
 
 def unseen_share(hits: Sequence[int]) -> float:
