@@ -26,6 +26,7 @@ ALLOWED = {
     "report_page.py": "reads files of this package",
     "export_controller.py": "reads files that it has written into a temporary folder",
     "libraries.py": "reads files of this package and output of the preprocessor",
+    "jax_metric.py": "reads a header of JAX",
     "output_folder.py": "opens a lock without waiting",
     "scratch_folder.py": "opens a lock without waiting",
     "path_files.py": "writes",
