@@ -75,7 +75,7 @@ STUDIES = {
         Study("fronts", "fronts", "where the default contact frames of the catalogue touch"),
         Study("shapes", "shapes", "the collision shapes of the catalogue, fitted again"),
         Study("feasible", "feasible", "what feasibility costs; seeds", 3, target="study-feasible"),
-        Study("approach", "approach", "speed at which robots arrive in their optima", target="study-feasible"),
+        Study("approach", "approach", "speed that robots can reach in optimal postures", target="study-feasible"),
         Study("restitution", "restitution", "rebound of each contact law", target="calibration"),
         Study("impacts", "impact.page", "objectives, and impacts in MuJoCo; postures", 30, target="study-impacts"),
         Study("elastic", "elastic.study", "arms with elastic joints in MuJoCo; postures", 20, target="study-elastic"),

@@ -102,7 +102,7 @@ def _caption(scans: Mapping[str, Sequence[Place]]) -> Iterator[str]:
 def _against(place: Place, start: Place) -> str:
     motion, jump = (percent(getattr(place, name) / getattr(start, name) - 1) for name in ("motion", "jump"))
     force = place.force / start.force
-    return f"the motion changes by {motion}, the jump by {jump} and the force by a factor of {force:.2g}"
+    return f"the motion changes by {motion}, the jump by {jump}, and the force becomes {force:.2g} times as large"
 
 
 def _scan(name: str, request: Request) -> list[Place]:

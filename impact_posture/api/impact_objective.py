@@ -127,7 +127,7 @@ class ImpactObjective(WorstCaseObjective):
         super().__init__(
             robot, leading, metric, chosen, feet, compliance, normal_cone_deg, tuple(more), bilateral, variants
         )
-        # PostureProblem chooses the objective type again, because the problem may state the speed.
+        # A PostureProblem may state a speed, and then chooses the objective type again from the given ``kind``.
         object.__setattr__(self, "_stated_kind", kind)
         # A missing support is not an error, because an impact can be evaluated without supports.
         object.__setattr__(self, "_missing", missing_support(robot) if supports is None and not feet else "")

@@ -75,7 +75,8 @@ def renumbered(count: int, faces: Triangles) -> Triangles | None:
 def _shifted(faces: Triangles, across: bool = False) -> Triangles:
     """Number the corners of all triangles from the first corner of the file.
 
-    A new part begins where a triangle uses the first corners of the node again; ``across`` also detects new nodes.
+    A file consists of nodes, and a node of parts.  The numbers of a new part begin again at the first corner of its
+    node.  ``across`` also detects parts that begin a new node.
     """
     starts, shifts, begin = [0], [0], 0
     for k in np.flatnonzero((np.diff(faces, axis=1) == 1).all(axis=1))[1:]:

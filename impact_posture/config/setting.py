@@ -30,7 +30,8 @@ class Setting:
         takes: Placeholder of the value in ``--help``.
         words: Description of the default value, if the default is not a constant.
         option: Spelling of the option, if it differs from the name of the field.
-        parse: Function that converts the text of the option to the value; for a repeatable option, the list of texts.
+        parse: Function that converts the text of the option to the value.  If the option is repeatable, its argument
+            is the list of all texts.
         repeatable: Whether the option may be given several times.
     """
 

@@ -147,9 +147,9 @@ class Tree(Kinematics):
         return total
 
     def mass_times(
-        self, v: ca.SX, velocities: ByJoint | None = None, *, extra: bool = True, less: Sequence[Wrench] = ()
+        self, v: ca.SX, velocities: ByJoint | None = None, *, extra: bool = True, wrenches: Sequence[Wrench] = ()
     ) -> ca.SX:
-        """Return ``M(q) v − Σ Jᵀ w`` in O(n), shape (nv,), where ``w`` are the wrenches ``less``.
+        """Return ``M(q) v − Σ Jᵀ w`` in O(n), shape (nv,), where ``w`` are the ``wrenches``.
 
         ``M`` includes the armature and, if ``extra`` is true, the extra inertias.  ``velocities`` may be the result
         of :meth:`velocities` for ``v``, which saves time.
@@ -157,7 +157,7 @@ class Tree(Kinematics):
         velocities = self.velocities(v) if velocities is None else velocities
         inertia = self._inertia if extra else self._own_inertia
         momenta = {i: inertia[i] @ velocity for i, velocity in velocities.items()}
-        for wrench in less:
+        for wrench in wrenches:
             momenta[wrench.point.joint] = momenta[wrench.point.joint] - self.link_force(wrench)
         return self._project(self._accumulate(momenta)) + self.armature * v
 

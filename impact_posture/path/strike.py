@@ -77,7 +77,7 @@ class Strike(JsonBlock):
 def check_strike(problem: ConstrainedProblem, speed: float) -> None:
     """Raise ``InputError`` unless contacts with held positions can arrive at a speed above zero, m/s.
 
-    A robot that falls freely can only land on level ground, whose normals do not turn with the contact frames.
+    A robot that falls freely can only land on level ground, because its normals must keep their directions.
     """
     fault, hint = "", "leave out `strike`"
     wanted, gravity = problem.requirements, problem.robot.model.gravity.linear

@@ -161,7 +161,7 @@ def _compile(spec: Any, path: Path) -> tuple[Any, list[str]]:
     for part in (*(asset for asset in assets if asset.name in missing), *spec.skins):
         spec.delete(part)
     files = listed([f"'{file}'" for file in sorted(missing.values())], 1)
-    return spec.compile(), [f"no mesh {files}: their shapes are left out; inertias are stated"]
+    return spec.compile(), [f"no mesh {files}: their shapes are left out; the file states all inertias"]
 
 
 def _asset(spec: Any, asset: Any) -> Path:

@@ -300,7 +300,7 @@ def test_missing_meshes(tmp_path: Path) -> None:
     mesh, stated = f'<geom type="mesh" mesh="m"/>{tip}', '<inertial pos="0 0 0" mass="1" diaginertia=".1 .1 .1"/>'
     drawn = text.replace(tip, stated + mesh)
     robot = loaded(tmp_path, drawn)
-    assert robot.warnings[0] == "no mesh 'm.stl': their shapes are left out; inertias are stated"
+    assert robot.warnings[0] == "no mesh 'm.stl': their shapes are left out; the file states all inertias"
     assert "hand" in {shape.link for shape in read_shapes(robot).shapes}
     with pytest.raises(MjcfError, match=r"no mesh 'm\.stl', and body 'hand' takes its inertia from the mesh"):
         loaded(tmp_path, text.replace(tip, mesh))

@@ -48,7 +48,8 @@ def places() -> list[Place]:
 def test_the_caption_says_what_the_picture_shows() -> None:
     arm, humanoid = scan._caption({ARM: places(), HUMANOID: places()[2::-1]})
     assert (
-        "H is lowest at 0 rad, where the motion changes by −90 %, the jump by −75 % and the force by a factor of 3."
+        "H is lowest at 0 rad, where the motion changes by −90 %, the jump by −75 %, "
+        "and the force becomes 3 times as large."
         in arm
     )
     assert "from the shipped 0.9 rad, the motion at first changes by +100 % (at 0.45 rad)" in arm

@@ -34,8 +34,8 @@ LEAST, LARGEST = 0.05, 2.0
 _REACH = 0.15
 EDGES = (0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 2.0)
 MODELS = ("elastic", "link", "reflected")
-# Assumed stiffness of joints 1 to 4 and 5 to 7 of an arm with strain wave gears, N m/rad.  No stiffness is published
-# for the two arms.
+# Stiffness of joints 1 to 4 and 5 to 7 of an arm with strain wave gears, N m/rad.  It is assumed for arms without a
+# published stiffness.
 ASSUMED = (14e3,) * 4 + (9e3,) * 3
 
 

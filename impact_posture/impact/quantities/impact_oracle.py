@@ -96,7 +96,7 @@ class ImpactOracle:
         return StickingPoint.of(self._kkt, J, J @ self.solve(J.T), self.robot.projector)
 
     def weigh(self, a: Array) -> Array:
-        """Return ``W a``; the entries of followers are zero, because their leaders determine them."""
+        """Return ``W a``.  The entries of joints that follow another joint are zero."""
         weighed = self.M @ a if self.metric.kind == "kinetic" else (self.metric.diagonal(self._nv) * a.T).T
         return np.asarray((weighed.T * ~self.robot.followers).T)
 

@@ -183,7 +183,7 @@ def unknown_jump(case: ImpactCase, tree: Tree, impacts: Sequence[Wrench], label:
         held.append(tree.own_velocity(foot.point, velocities)[: foot.rows] + case.compliance * f_k)
         f = ca.vertcat(f, f_k)
     pushed = -tree.generalized_force(impacts)
-    momentum = tree.mass_times(a, velocities, less=wrenches) + pushed
+    momentum = tree.mass_times(a, velocities, wrenches=wrenches) + pushed
     for follower, leader, ratio in case.robot.coupled_entries:
         for rows in (momentum, pushed):
             rows[leader] += ratio * rows[follower]

@@ -76,8 +76,8 @@ def prepare(settings: ProblemSettings, impact: ResolvedImpact | None = None) -> 
     """
     impact = resolve(settings) if impact is None else impact
     if impact.robot.joint_model == "elastic":
-        fault = "the joint model elastic only predicts the impact at one given posture"
-        hint = "optimize with the joint model link or reflected, and evaluate the optimum with elastic"
+        fault = "the joint model `elastic` only predicts the impact at one given posture"
+        hint = "optimize with the joint model `link` or `reflected`, and evaluate the optimum with `elastic`"
         raise InputError(fault, where="joint_model", hint=hint)
     if settings.q is not None:
         impact = replace(impact, q=impact.robot.check_posture(np.array(settings.q), where="q"))

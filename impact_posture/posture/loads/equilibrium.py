@@ -172,8 +172,8 @@ class Equilibrium:
             return Distribution(np.zeros(0), c, 0.0, jacobian)
         z, unbalanced, duals = self._least_share(A, b, S, c) or self._least_imbalance(A, b)
         shares = S @ z + c
-        # The derivative of the optimal value is the derivative of R τ at fixed z, multiplied by the multipliers of
-        # the rows of R τ.
+        # The derivative of the optimal value is the derivative of the rows R τ at fixed z, weighted with the Lagrange
+        # multipliers ``duals``.
         gradient = duals @ self.rows @ self.load.torque(q, z).by_posture
         worst = np.abs(shares) > np.abs(shares).max(initial=0.0) - _TIED
         jacobian[np.append(unbalanced > 0, worst & (unbalanced == 0))] = gradient
