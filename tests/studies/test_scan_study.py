@@ -49,8 +49,7 @@ def test_the_caption_says_what_the_picture_shows() -> None:
     arm, humanoid = scan._caption({ARM: places(), HUMANOID: places()[2::-1]})
     assert (
         "H is lowest at 0 rad, where the motion changes by −90 %, the jump by −75 %, "
-        "and the force becomes 3 times as large."
-        in arm
+        "and the force becomes 3 times as large." in arm
     )
     assert "from the shipped 0.9 rad, the motion at first changes by +100 % (at 0.45 rad)" in arm
     assert "at 1.5 rad, H rises from 40 to 80, and the motion changes by −50 %, the jump by −50 %" in arm
