@@ -81,8 +81,7 @@ STUDIES = {
         Study("elastic", "elastic.study", "arms with elastic joints in MuJoCo; postures", 20, target="study-elastic"),
         Study("hits", "hits.study", "recorded hits of an iiwa 7, predicted; resamples", 200, target="study-hits"),
         Study("global", "global_search:maps", "self-motions and their bounds; seeds", 10, target="study-global"),
-        Study("search", "search_quality:arms", "the default search and 16 starts; seeds", 3, target="study-global"),
-        Study("search-catalogue", "search_quality:catalogue", "default search, catalogue; seeds", 3, page=False),
+        Study("search", "search_quality", "the default search and 16 starts; seeds", 3, target="study-global"),
         Study(
             "screening", "random_postures", "random postures of talos; postures", 100_000_000, target="study-global"
         ),

@@ -178,10 +178,10 @@ def test_the_adaptive_search_reaches_what_sixteen_starts_miss() -> None:
 
 
 def test_hops_reach_what_random_postures_miss(monkeypatch: pytest.MonkeyPatch) -> None:
-    problem = random_arm(22)
-    hops = solve(problem, screened=1024, jobs=1, compile="never")
+    problem = random_arm(7)
+    hops = solve(problem, screened=1024, seed=1, jobs=1, compile="never")
     monkeypatch.setattr(screening_module, "_HOPPING", 0.0)
-    random = solve(problem, screened=1024, jobs=1, compile="never")
+    random = solve(problem, screened=1024, seed=1, jobs=1, compile="never")
     assert hops.estimate.hops > 300 and random.estimate.hops == 0
     assert hops.optima[0].objective < 0.8 * random.optima[0].objective
 
@@ -218,6 +218,8 @@ def test_collisions_and_loads_stay_excluded(robot: str, normal: tuple[float, flo
     problem = prepare(make_settings({"robot": robot, "normal": normal, "collision": True, "holdable": True})).problem
     solution: PostureSolution = solve(problem, screened=128, jobs=1, compile="never")
     assert solution.certificate.holds()
+    # The first random postures leave descents for hops.
+    assert solution.estimate.hops > 30
     assert problem.surroundings is not None and not problem.surroundings.collisions(solution.q)
     initial = problem.objective.value(solution.initial)
     assert problem.objective.value(solution.q) <= initial * (1 + 1e-9)

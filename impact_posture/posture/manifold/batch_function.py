@@ -28,8 +28,8 @@ _WIDTH = 512
 # Number of postures in a block of the loop in C.  In a smaller block, branching to the code of each operation would
 # take most of the time.
 _LANES = 64
-# Below this number of postures, CasADi is faster.
-_SMALL = 64
+# Below these numbers of postures, CasADi is faster than the loop in C, and than NumPy.
+_FEW, _SMALL = 3, 64
 
 
 def _if_else_zero(condition: Array, value: Array, out: Array) -> None:
@@ -137,10 +137,10 @@ class BatchFunction:
 
     def __call__(self, *inputs: Array) -> list[Array]:
         """Return the outputs at each row of the inputs, shape (N, rows, columns)."""
-        count = len(inputs[0])
-        if count < _SMALL or self._operations is None:
+        count, run = len(inputs[0]), _compiled_loop()
+        if count < (_FEW if run else _SMALL) or self._operations is None:
             return self._one_by_one(inputs)
-        if (run := _compiled_loop()) is not None:
+        if run:
             return self._in_blocks(run, np.concatenate(inputs, axis=1))
         parts = [self._together([x[k : k + _WIDTH] for x in inputs]) for k in range(0, count, _WIDTH)]
         return [np.concatenate(pieces) for pieces in zip(*parts, strict=True)]

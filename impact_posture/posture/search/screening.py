@@ -28,6 +28,9 @@ from impact_posture.system.arrays import Array
 
 # Number of descents that run together.  New descents begin when a quarter of these descents has ended.
 _WIDTH = 512
+# Largest fraction of all allowed descents that run together.  Otherwise, the first random postures of a large robot
+# would leave none for hops.
+_FIRST = 1 / 4
 # When no more descents may begin, the search ends if the descents that still run are at most this fraction of the
 # ended descents.  A small batch takes nearly as long as a large one.
 _SLOWEST = 1 / 16
@@ -61,7 +64,7 @@ _HITS = 12
 # Degrees of freedom up to which ``_HITS`` suffices.  Each further degree of freedom doubles the number of hits,
 # because the number of optima grows exponentially with the degrees of freedom.
 _FREE = 5
-# The search stops only after this number of descents has ended.
+# The search stops only after this number of descents, or after half of all allowed descents, has ended.
 _ENDS = 256
 # The search stops only if the last descents, this fraction of all ended descents, did not lower the best merit.
 _IDLE = 0.5
@@ -110,11 +113,11 @@ def screen(problem: ConstrainedProblem, initial: Array, most: int, seed: int) ->
     """Screen at most ``most`` random postures and hops, some of them near the posture ``initial``, shape (nq,)."""
     search = _Search(problem, initial, seed)
     most = min(most, max(_LEAST, _WORK // problem.robot.nv**4))
-    width, drawn = min(_WIDTH, most), 0
+    width, drawn = min(_WIDTH, max(int(_FIRST * most), _LEAST)), 0
     while True:
         room = width - search.descent.active
         if room >= width // 4:
-            if search.settled(max(min(_ENDS, width // 2), 1)):
+            if search.settled(max(min(_ENDS, most // 2), 1)):
                 break
             count = min(room, most - drawn)
             search.begin(count)
