@@ -57,6 +57,7 @@ def run_sanitized(folder: Path, program: str, sanitizers: str, out: Path, *words
     return "" if ran.returncode == 0 else f"{ran.returncode}: {ran.stdout} {ran.stderr[-1000:]}"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("flow", [False, True], ids=["", "flow"])
 @pytest.mark.parametrize("name", CONTROLLERS)
 def test_parameters_of_controllers(name: str, flow: bool, tmp_path: Path, hostile_full: bool) -> None:

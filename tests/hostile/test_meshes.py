@@ -122,6 +122,7 @@ def test_meshes_made_to_break_their_reader(good: dict[str, Path], tmp_path: Path
             judge(path.name, slow + ([] if str(path) in str(caught.value) else [f"says {caught.value}"]))
 
 
+@pytest.mark.long
 def test_many_slow_meshes(good: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("impact_posture.collision.mesh_file._LEAST_SECONDS", 0.2)
     paths = [write(tmp_path / f"{k}.dae", MESHES["doubled 40 times.dae"]) for k in range(5)]

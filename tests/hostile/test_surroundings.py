@@ -89,6 +89,7 @@ def test_the_backend_of_a_notebook_is_not_ours() -> None:
     assert (done.stdout, done.stderr) == ("agg\n", "")
 
 
+@pytest.mark.long
 def test_pictures_whatever_the_backend_and_without_noise(tmp_path: Path) -> None:
     nothing = "/proc/nothing"
     # NumPy and Matplotlib read the date of a reproducible build.

@@ -194,6 +194,7 @@ def test_a_strike_beyond_the_joints_gets_the_greatest_speed() -> None:
     assert len(speeds) > 10 and max(speeds) <= required.speed * 1.002
 
 
+@pytest.mark.long
 def test_a_clearance_that_conflicts_with_the_speed_of_a_strike_slows_it() -> None:
     """At 1 m/s, a link of panda would touch the wall.  No random posture without collisions is much faster."""
     posed = prepared("panda", 1.0, strike=True, normal=(-1, 0, 0), hold=None, collision=True)
