@@ -278,7 +278,8 @@ def test_hits_of_guesses_that_one_optimum_attracts_are_added() -> None:
 @pytest.mark.parametrize("starts", [4, 40])
 def test_the_numbers_of_a_search_agree(starts: int) -> None:
     estimate = solve(random_arm(3), screened=starts, jobs=1, compile="never").estimate
-    assert estimate.hits_of_best + estimate.optima - 1 <= estimate.starts + estimate.given
+    # Hops may end at objectives where no start ends.
+    assert estimate.hits_of_best + estimate.optima - 1 <= estimate.starts + estimate.hops + estimate.given
     assert estimate.given == 1 and estimate.starts + estimate.hops <= starts
 
 
