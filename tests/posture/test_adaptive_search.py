@@ -178,7 +178,7 @@ def test_the_adaptive_search_reaches_what_sixteen_starts_miss() -> None:
 
 
 def test_hops_reach_what_random_postures_miss(monkeypatch: pytest.MonkeyPatch) -> None:
-    problem = random_arm(7)
+    problem = random_arm(22)
     hops = solve(problem, screened=1024, seed=1, jobs=1, compile="never")
     monkeypatch.setattr(screening_module, "_HOPPING", 0.0)
     random = solve(problem, screened=1024, seed=1, jobs=1, compile="never")

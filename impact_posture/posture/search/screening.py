@@ -30,16 +30,19 @@ from impact_posture.system.arrays import Array
 _WIDTH = 512
 # Largest fraction of all allowed descents that run together.  Otherwise, the first random postures of a large robot
 # would leave none for hops.
-_FIRST = 1 / 4
+_FIRST = 1 / 2
 # This number of descents may always run together.  A smaller batch takes nearly as long, so talos would answer 0.5 s
 # later.
 _NARROW = 32
 # When no more descents may begin, the search ends if the descents that still run are at most this fraction of the
 # ended descents.  A small batch takes nearly as long as a large one.
 _SLOWEST = 1 / 16
-# Limit of the number of descents times the fourth power of the degrees of freedom, because descents of large robots
-# take longer.
-_WORK = 40_000_000
+# Limit of the number of descents times the square of the degrees of freedom, because descents of large robots take
+# longer.
+_WORK = 800_000
+# Degrees of freedom above which the limit falls with the tenth power instead.  A descent of a humanoid takes as long
+# as ten descents of a quadruped.
+_LARGE = 24
 # Number of descents that are always allowed.
 _LEAST = 16
 # If less than this fraction of the first random postures reaches the equalities, the descents end at too similar
@@ -63,7 +66,7 @@ _CROSSED = 0.6
 _SAME = 0.05
 # The search may stop when the best merit was reached from this number of random postures and worse final postures;
 # ``_FREE``, ``_ENDS`` and ``_IDLE`` are further conditions.
-_HITS = 12
+_HITS = 24
 # Degrees of freedom up to which ``_HITS`` suffices.  Each further degree of freedom doubles the number of hits,
 # because the number of optima grows exponentially with the degrees of freedom.
 _FREE = 5
@@ -115,7 +118,8 @@ def screenable(problem: ConstrainedProblem) -> bool:
 def screen(problem: ConstrainedProblem, initial: Array, most: int, seed: int) -> Screening:
     """Screen at most ``most`` random postures and hops, some of them near the posture ``initial``, shape (nq,)."""
     search = _Search(problem, initial, seed)
-    most = min(most, max(_LEAST, _WORK // problem.robot.nv**4))
+    nv = problem.robot.nv
+    most = min(most, max(_LEAST, int(_WORK / nv**2 * min(_LARGE / nv, 1) ** 8)))
     width, drawn = min(_WIDTH, most, max(int(_FIRST * most), _NARROW)), 0
     while True:
         room = width - search.descent.active
