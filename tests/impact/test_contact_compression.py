@@ -343,7 +343,7 @@ def test_the_commands(tmp_path: Path) -> None:
     assert "elastic joints on 1e+06 N/m" in shown.stdout and "largest torque of panda_joint4" in shown.stdout
     for options, words in (
         (("evaluate", *between), "add --contact-stiffness"),
-        (("optimize", *between, "--contact-stiffness", 1e6), "evaluate the optimum with elastic"),
+        (("optimize", *between, "--contact-stiffness", 1e6), "evaluate the optimum with 'elastic'"),
     ):
         failed = run(*options)
         assert failed.returncode == 1 and words in failed.stderr and "Traceback" not in failed.stderr
