@@ -169,6 +169,7 @@ def test_a_flying_robot_without_a_tilt_task_is_a_warning_before_the_run(aerial: 
     assert [f"warning: {note}" for note in notes[:1]] == [warning]
 
 
+@pytest.mark.long
 def test_compare_robots_that_fall(falls: Path, tmp_path: Path) -> None:
     options = "--controllers nominal,stiff --seeds 1 --out both --format png --quiet --no-report".split()
     done = start("compare", str(falls), *options, cwd=tmp_path)

@@ -272,7 +272,7 @@ def test_an_obstacle_at_the_contact_is_named() -> None:
     assert caught.value.exit_code == 3
 
 
-@pytest.mark.long(but=("full-position1", "position-position2"))
+@pytest.mark.long(but=("position-position2",))
 @pytest.mark.usefixtures("few_tries")
 @pytest.mark.parametrize(
     ("pose", "position"), [("full", None), ("full", (3.0, 0.0, 0.0)), ("position", (3.0, 0.0, 0.0))]

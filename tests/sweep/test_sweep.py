@@ -286,6 +286,7 @@ def test_an_interrupted_sweep_continues_in_either_pass(tmp_path: Path, whole: di
     assert [path.name for path in folder.glob("first-pass/**/*")] == ["notes.txt"]
 
 
+@pytest.mark.long
 def test_neighboring_shards_share_their_optima(tmp_path: Path) -> None:
     """In the first pass, the points of the sweep end in different optima."""
     sweep = read_sweep(write(SWITCHING.format(starts=2, shard=1), tmp_path))
