@@ -186,7 +186,7 @@ def shortest_stroke(
     before: bool,
     factor: float = 1.0,
 ) -> tuple[Stroke, float | None]:
-    """Return a stroke and its shortest duration within the limits, s; ``None`` if there is no such duration."""
+    """Return a stroke and its shortest duration within the limits, s; ``None`` if no duration suffices."""
     for time in _LENGTHS:
         stroke = Stroke(space, q, u, rows, time, before=before)
         duration = None if stroke.curve is None else stroke.shortest(limits, factor)

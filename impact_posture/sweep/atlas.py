@@ -178,7 +178,7 @@ class Atlas:
         return passes, content
 
     def _first(self, shard: int) -> bytes | None:
-        """Return the content of a shard file from the first pass; ``None`` if there is no usable file."""
+        """Return the content of a shard file from the first pass; ``None`` without a usable file."""
         files = (self._read(shard, place) for place in (_DATA, _FIRST_PASS))
         return next((content for passes, content in files if passes == 1), None)
 

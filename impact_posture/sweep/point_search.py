@@ -47,7 +47,7 @@ class PointResult(NamedTuple):
 
     Attributes:
         row: Column name → value of the grid point in the table.
-        start: Posture of the grid point, from which other points can start; ``None`` if no posture was found.
+        start: Posture of the grid point, from which other points can start; ``None`` if the point has no posture.
         violation: Smallest known weighted sum of all constraint violations; 0 if the grid point is not infeasible.
     """
 
@@ -57,7 +57,7 @@ class PointResult(NamedTuple):
 
     @property
     def q(self) -> Array | None:
-        """Posture of the grid point, shape (nq,); ``None`` if no posture was found."""
+        """Posture of the grid point, shape (nq,); ``None`` if the point has no posture."""
         return self.start and self.start.q
 
 

@@ -74,7 +74,7 @@ def read_shard(content: bytes) -> list[PointResult]:
 
 
 def read_postures(content: bytes) -> list[list[float] | None]:
-    """Return the posture of each point, from the content of a shard file; ``None`` if no posture was found."""
+    """Return the posture of each point, from the content of a shard file; ``None`` for points without a posture."""
     import pyarrow as pa
     from pyarrow import parquet
 

@@ -214,7 +214,7 @@ def _times(values: Iterable[Any]) -> Vector:
 
 
 def contact_row(effort: Vector, command: Vector) -> int | None:
-    """Return the first row in which the contact shows; ``None`` if there is no such row.
+    """Return the first row in which the contact shows; ``None`` if no row shows it.
 
     About 45 to 60 ms after the contact, the controller brakes, and its torque on joint 1 falls at once.  The contact
     is searched in the 70 ms before the braking.  The contact row is the first row in which the effort of a joint

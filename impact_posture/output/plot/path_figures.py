@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 NOTES = {
     "distance": "Each point is the best posture found within this distance from the initial posture (joint angles, "
     "sliding joints and base in one norm)",
-    "force": "Each point is the best posture found whose impact has at most this peak force",
+    "force": "Each point is the best posture of the search whose impact has at most this peak force",
 }
 _LINES = "; lines between points only join them. Hollow: not certified as an optimum."
 _KNEE = (

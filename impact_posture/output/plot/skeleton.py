@@ -30,7 +30,7 @@ class Skeleton:
         bones: End points of the sticks, shape (k, 2, 3).
         joints: Origins of the moving joints, shape (j, 3).
         base: Placement of the floating base; the identity for a fixed base.
-        body: Corners of the box around the hips, low corners first, shape (8, 3); (0, 3) if there is no box.
+        body: Corners of the box around the hips, low corners first, shape (8, 3); (0, 3) without a box.
         contacts: Impact contact points, shape (c, 3).
         normals: Unit normals at the contact points, shape (c, 3).
         feet: Contact points of the supports, shape (f, 3).

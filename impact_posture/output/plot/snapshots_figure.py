@@ -125,7 +125,7 @@ def _surface(axes: Any, view: RunView, plane: Plane, low: Array, high: Array) ->
 
 
 def _arrow(view: RunView, plane: Plane, reach: float) -> Array | None:
-    """Return the arrow of the push as a vector of length ``reach``, shape (2,); ``None`` if there is no push."""
+    """Return the arrow of the push as a vector of length ``reach``, shape (2,); ``None`` without a push."""
     largest = view.force[int(np.argmax(np.linalg.norm(view.force, axis=1)))]
     size = float(np.linalg.norm(largest))
     if not view.pushed or size == 0:

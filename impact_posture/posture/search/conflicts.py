@@ -68,7 +68,7 @@ def find_conflicts(
     """Minimize the slack ``Σ (s⁺ + s⁻)`` with ``c(q) + s⁺ − s⁻`` within bounds, from ``guesses`` and other starts.
 
     ``program`` may belong to the same problem with another target or with fewer rows.  ``beside`` is the least
-    violation that a search found for a nearby target.  The search stops after :data:`_CONFIRMING` starts if the least
+    violation of a search for a nearby target.  The search stops after :data:`_CONFIRMING` starts if the least
     violation so far is at least half of ``beside``.
     """
     chart = Chart.of(problem.robot.model)

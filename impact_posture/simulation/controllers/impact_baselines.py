@@ -78,7 +78,7 @@ class InvariantDriver(ImpactFeedbackDriver):
     There are three differences from the paper:
 
     1. A force sensor corrects the scheduled time ``t*`` of the impact.
-    2. The posture task affects ``λ*`` only if there are no other tasks, because the posture target rests while other
+    2. The posture task affects ``λ*`` only without other tasks, because the posture target rests while other
        targets move.  The paper has no redundant posture.
     3. The impulses at standing feet follow from the impulse at the contact (``M⁻¹`` contains the constraints of the
        feet).  In the paper, the impulses at the feet are free variables.  On our robots, free impulses at the feet

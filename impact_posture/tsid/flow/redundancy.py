@@ -27,7 +27,7 @@ class Redundancy:
         basis: Orthonormal basis ``Z`` of the null space, shape (nv, r).
         inverse: Pseudo-inverse ``J⁺`` on the constrained directions, shape (nv, rows).
         springs: ``k JZ`` of nearly dependent constraints, which are springs of stiffness ``k``, shape (rows, r);
-            ``None`` if there are no springs.
+            ``None`` without springs.
         stiffness: Stiffness ``k s²`` of the springs along each column of ``Z``, shape (r,), or ``None``.
     """
 

@@ -87,7 +87,7 @@ class FrameTask(TargetTask[Target]):
         return self.select(here, here.drift)
 
     def feedforward(self, state: State) -> Array | None:
-        """Return ``M_d⁻¹ F̂``; return ``None`` if there is no impedance or no measured force."""
+        """Return ``M_d⁻¹ F̂``; return ``None`` without an impedance or a measured force."""
         if self._soften is None or not state.pushed:
             return None
         return self.select(state.at(self.point), self._soften * state.force)
