@@ -21,16 +21,18 @@ from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import ImpactPostureError
 from impact_posture.experiment.job_store import key_of
 from impact_posture.experiment.jobs import Job, execute
+from impact_posture.impact.evaluation.coulomb_jump import coulomb_jumps
 from impact_posture.simulation.controllers.contact_reference import Reference
 from impact_posture.simulation.controllers.controller_factory import ControllerFactory
-from impact_posture.simulation.metrics import saturated
+from impact_posture.simulation.metrics import before, saturated
 from impact_posture.simulation.offline_posture import OfflinePosture, offline_posture
 from impact_posture.simulation.outcome import judge
 from impact_posture.simulation.prediction import predict
+from impact_posture.simulation.run import Run
 from impact_posture.simulation.run import run as simulate
 from impact_posture.simulation.scenario_file import RepeatedContacts, Scenario, Spread
 from impact_posture.simulation.seed_variation import set_up_with
-from impact_posture.simulation.setup import set_up
+from impact_posture.simulation.setup import Setup, set_up
 from impact_posture.system.arrays import Array
 
 # A number after a name replaces the approach speed of the scenario, m/s.
@@ -82,9 +84,10 @@ def struck(case: str, name: str, seed: int, offline: Callable[..., OfflinePostur
     # A point of the expected surface and a point of the true surface.
     stated, true = (each.world.built.points[task.surface] for each in (set_up(setup.scenario), setup))
     due = reference.start(0) + reference.crossing + scenario.normal @ (stated - true) / task.speed
-    before = record.series.slice(reference.start(0), window.begin)
-    ticks = np.logical_or(*saturated(setup, record.series))[before].sum()
+    approach = record.series.slice(reference.start(0), window.begin)
+    ticks = np.logical_or(*saturated(setup, record.series))[approach].sum()
     contact = None if not part["prediction"] else {
+        "own": _of_own_speeds(setup, record) if setup.scenario.falls else None,
         "speed": part["prediction"][0]["approach"] / task.speed - 1,
         "instant": window.begin - float(due),
         "ratio": part["prediction"][0]["ratio"],
@@ -94,6 +97,24 @@ def struck(case: str, name: str, seed: int, offline: Callable[..., OfflinePostur
     plan = (document["path"] or {}).get("strike")
     why = "; ".join(dict.fromkeys(event["what"] for event in document["events"]))
     return {"status": document["status"], "why": why, "plan": plan, "contact": contact}
+
+
+def _of_own_speeds(setup: Setup, record: Run) -> float | None:
+    """Return the measured jump divided by the jump of feet that land together, each with its own landing speed.
+
+    The landing speed is the greatest speed towards the ground until the last foot has landed.
+    """
+    objective, (window,), series = ControllerFactory(setup).objective(), record.of("impact"), record.series
+    k, ticks = before(series, window), series.slice(window.begin, window.begin + window.landing)
+    speeds, numeric = [], Numeric(setup.robot.model)
+    for q, v in zip(series.q[k : ticks.stop], series.v[k : ticks.stop], strict=True):
+        model = numeric.at(q)
+        points = [single.oracle.point for single in objective.singles]
+        speeds.append([-setup.scenario.normal @ model.jacobian(point)[:3] @ v for point in points])
+    (prediction,) = predict(setup, objective, record)
+    landing = np.max(speeds, axis=0) * (1 + (prediction.restitution or 0.0))
+    jumps = coulomb_jumps(objective, series.q[k], landing)
+    return None if jumps is None else prediction.measured / jumps[0].norm
 
 
 def results(case: str, name: str, seeds: range) -> list[dict[str, Any]]:
@@ -173,6 +194,10 @@ def _notes(runs: list[dict[str, Any]]) -> Iterator[str]:
     """Yield what happened first in runs that did not complete, and what the plan of the first run could not reach."""
     for (status, first), count in Counter((r["status"], r["why"].split("; ")[0]) for r in runs if r["why"]).items():
         yield f"{count} of {len(runs)} runs: {status}; {first.rstrip('.')}"
+    own = [run["contact"]["own"] for run in runs if run["contact"] and run["contact"]["own"]]
+    if own:
+        worst = max(own, key=lambda ratio: abs(ratio - 1))
+        yield f"measured jump / jump predicted with the landing speed of each foot: {median(own):.2f} ({worst:.2f})"
     plan = runs[0]["plan"]
     if plan is not None and plan["follow_through"] is not None:
         stop = plan["follow_through"]

@@ -65,7 +65,7 @@ def render_path(s: Structure, reference: PathReference, prefix: str) -> dict[str
         "path_stop_rows": _segments(stop) if stop else np.zeros(1),
         "path_end": path.q[-1],
         "path_velocity": path.v[-1],
-        "path_approach": reference.approach,
+        "path_approach": reference.approach[0],
         "path_defaults": np.array([reference.late, reference.felt, reference.stopped, reference.lag]),
     }
     context = {

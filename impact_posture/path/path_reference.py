@@ -35,8 +35,8 @@ class PathReference:
     velocity of the impact for at most the time ``late``.  The contact is noticed at the first of three events:
 
     1. A measured force exceeds ``felt``.
-    2. The contact point has less than the share ``stopped`` of its planned speed, both computed with the Jacobian at
-       the planned contact.
+    2. Every contact point has less than the share ``stopped`` of its planned speed, both computed with the Jacobian
+       at the planned contact.
     3. The contact is later than expected by the time ``late``.
 
     Then the references follow the stop after the impact.  The stop starts from the reference posture at the contact,
@@ -46,12 +46,12 @@ class PathReference:
 
     Attributes:
         path: The path.
-        approach: Speed of the contact point towards the surface per generalized velocity, shape (nv,), at the end of
-            the path.  If the contact is not known, the entries are zero, and the second event (see above) never
+        approach: Speed of each contact point towards the surface per generalized velocity, shape (m, nv), at the end
+            of the path.  If the contact is not known, the entries are zero, and the second event (see above) never
             occurs.
         late: Longest time for which the references continue after the expected contact, s.
         felt: Force above which a contact is felt, N.
-        stopped: The contact is noticed if the contact point has less than this share of its planned speed.
+        stopped: The contact is noticed if every contact point has less than this share of its planned speed.
         lag: Time by which the accelerations are ahead of postures and velocities, s, because the thrust of rotors
             lags behind its command.
         phase: Phase at the last tick.
@@ -62,7 +62,7 @@ class PathReference:
 
     def __init__(self, path: PosturePath, approach: Array | None = None, lag: float = 0.0) -> None:
         self.path, self.lag = path, lag
-        self.approach = np.zeros(path.model.nv) if approach is None else approach
+        self.approach = np.zeros((1, path.model.nv)) if approach is None else np.atleast_2d(approach)
         self.late, self.felt, self.stopped = self.LATE, self.FELT, self.STOPPED
         strike = path.strike
         self._run_up = path.duration if strike is None else strike.run_up_s
@@ -133,7 +133,7 @@ class PathReference:
         if force is not None and force > self.felt:
             return True
         assert self.path.strike is not None  # noqa: S101 (only a strike touches)
-        speed, wanted = float(self.approach @ v), float(self.approach @ planned)
+        speed, wanted = float((self.approach @ v).max()), float((self.approach @ planned).max())
         # At the beginning of the run-up, the planned speed is too small for a comparison.
         return speed < self.stopped * wanted > self.stopped**2 * self.path.strike.speed
 

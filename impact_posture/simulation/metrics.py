@@ -11,10 +11,10 @@ from impact_posture.simulation.run import Run
 from impact_posture.simulation.series import RECOVERY, Array, Flags, Series, Window
 from impact_posture.simulation.setup import Setup
 
-# The velocity jump is measured within this time after the first touch, s.
+# The velocity jump is measured until this time after the last contact of an impact has touched, s.
 JUMP = 0.015
 # Words in figures and tables for the time ``JUMP``.
-AFTER_TOUCH = f"{1e3 * JUMP:g} ms of the touch"
+AFTER_TOUCH = f"{1e3 * JUMP:g} ms of the touch (in a fall, of the last foot)"
 # Words in figures and tables for the time window in which the recovery is measured.
 UNTIL_RECOVERY = f"until {RECOVERY:g} s after each impact began"
 # A command is saturated if its distance from a limit is below this share of the range.
@@ -32,7 +32,8 @@ class Metrics:
         q_total_dwell: ``∫‖ν‖dt`` over the dwell windows, 0 for pushes.
         q_total_recovery: ``∫‖ν‖dt`` over the recovery windows, which are long enough to contain delayed motions.
         peak_jump: Largest ``‖ν(t) − ν⁻‖`` within 15 ms after the first touch, averaged over the contacts (0 without
-            contact).  For pushes, the largest ``‖ν‖`` within the window.
+            contact).  If several contacts strike together, the 15 ms begin when the last contact touches, so that
+            the impact is complete.  For pushes, the largest ``‖ν‖`` within the window.
         peak_jump_max: Like ``peak_jump``, but the largest value over the contacts.
         peak_recovery: Like ``peak_jump``, but within the whole recovery window.
         peak_force: Largest normal force within the impact windows, N.  For pushes, ``peak_force`` is the force of the
@@ -163,13 +164,14 @@ def before(series: Series, window: Window) -> int:
 
 
 def impact_load(setup: Setup, series: Series, window: Window) -> ImpactLoad:
-    """Return the effects on base, joints and contact within :data:`JUMP` after the start of an impact window.
+    """Return the effects on base, joints and contact until :data:`JUMP` after the last contact has touched.
 
-    The jump is the largest ``‖ν(t) − ν⁻‖`` within :data:`JUMP`, or for pushes, the largest ``‖ν‖`` within the window.
+    The jump is the largest ``‖ν(t) − ν⁻‖`` in this interval, or for pushes, the largest ``‖ν‖`` within the window.
     The changes of base and joints are the largest changes in the same interval.  The peak force is the largest force
     in the window.
     """
-    end, inside = window.end if setup.scenario.push else window.begin + JUMP, series.slice(window.begin, window.end)
+    end = window.end if setup.scenario.push else window.begin + window.landing + JUMP
+    inside = series.slice(window.begin, window.end)
     ticks, k = series.slice(window.begin, end), before(series, window)
     change = _change(setup, series, window, end)
     effect = impact_effect(setup.robot, change if len(change) else np.zeros(setup.robot.nv))

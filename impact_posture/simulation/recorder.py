@@ -77,15 +77,15 @@ class Recorder:
         self._traces.append(trace)
         self._columns.append(columns)
 
-    def first_touch(self, begin: float, end: float) -> float | None:
-        """Return the time of the first touch within ``[begin, end)``, s; ``None`` if there is no touch."""
+    def first_touches(self, begin: float, end: float) -> list[float]:
+        """Return the sorted times of the first touch of each contact that touches within ``[begin, end)``, s."""
         trace, first = self._trace(), list[float]()
         for k in self._shapes:
             # During a contact, ``began`` has a new time in every tick, so only the first tick of the contact is used.
             before = np.concatenate([[False], trace.touching[:-1, k]])
             touches = trace.began[~before, k]
             first += touches[(begin <= touches) & (touches < end)][:1].tolist()
-        return min(first, default=None)
+        return sorted(first)
 
     def series(self) -> Series:
         """Return the time series of all recorded ticks."""

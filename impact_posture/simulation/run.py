@@ -205,11 +205,12 @@ def _contacts(loop: _Loop, task: RepeatedContacts, mode: Mode) -> Run:
     windows = []
     for k, start in enumerate(starts):
         end = start + reference.cycle
-        touch = loop.recorder.first_touch(start, end)
-        begin = start + reference.crossing if touch is None else touch
+        touches = loop.recorder.first_touches(start, end)
+        begin = touches[0] if touches else start + reference.crossing
+        landed = max((touch - begin for touch in touches if touch <= begin + task.window), default=0.0)
         leaves = start + reference.inward + task.dwell
         ends = {"impact": begin + task.window, "dwell": max(leaves, begin), "recovery": min(begin + RECOVERY, end)}
-        windows += [Window(kind, k, begin, until, touch is not None) for kind, until in ends.items()]
+        windows += [Window(kind, k, begin, until, bool(touches), landed) for kind, until in ends.items()]
     windows.sort(key=lambda window: window.kind != "impact")
     return Run(loop.recorder.series(), tuple(windows), away=loop.away)
 
@@ -243,10 +244,10 @@ def _push(loop: _Loop, task: SinglePush | Throw, sign: int, rested: bool) -> Run
         loop.recorder.pushed(np.array(push.force), begin, begin + length)
     loop.driver.expect(expected)
     loop.ticks(round((expected - begin + length + task.after) / loop.period))
-    touch = loop.recorder.first_touch(begin, np.inf) if isinstance(task, Throw) else begin
-    hit = expected if touch is None else touch
+    touches = loop.recorder.first_touches(begin, np.inf) if isinstance(task, Throw) else [begin]
+    hit = touches[0] if touches else expected
     ends = {"impact": length, "recovery": min(RECOVERY, length + task.after)}
-    windows = tuple(Window(kind, 0, hit, hit + end, touch is not None) for kind, end in ends.items())
+    windows = tuple(Window(kind, 0, hit, hit + end, bool(touches)) for kind, end in ends.items())
     return Run(loop.recorder.series(), windows, sign, hit, rested, loop.away)
 
 

@@ -37,6 +37,8 @@ class Window:
         end: End of the window, s.
         touched: Whether the impact happened.  Without an impact, the window begins at the expected time of the
             impact.
+        landing: Time from ``begin`` until each of several contacts has touched for the first time, s.  Only touches
+            within an impact window count.  The time is zero for a single contact.
     """
 
     kind: str
@@ -44,6 +46,7 @@ class Window:
     begin: float
     end: float
     touched: bool
+    landing: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

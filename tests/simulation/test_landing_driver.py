@@ -66,6 +66,19 @@ def test_the_robot_stands_after_the_landing() -> None:
     assert abs(series.v[-1, 2]) < 0.4 < abs(series.v[before(series, record.of("impact")[0]), 2])
 
 
+def test_a_leg_keeps_its_posture_until_its_foot_lands() -> None:
+    """On tilted ground, a controller that stands too early would swing the legs in the air at 16 rad/s."""
+    setup = set_up_with(replace(scenario_of(), spread=Spread(normal=5.0)), 4)
+    record = driven(controller_factory(setup), "nominal")
+    (window,), series, contacts = record.of("impact"), record.series, setup.scenario.contacts
+    assert contacts is not None and 0.015 < window.landing < window.end - window.begin
+    fall = series.slice(0.0, window.begin + window.landing - 2e-3)
+    model = setup.robot.model
+    frames = [model.frames[setup.robot.frame_id(frame)] for frame in contacts.frames]
+    knees = [np.abs(series.v[fall, model.joints[frame.parentJoint].idx_v]).max() for frame in frames]
+    assert min(knees) < 0.1 and sorted(knees)[1] > 3.0
+
+
 def test_the_prediction_counts_all_feet() -> None:
     factory, record = dropped()
     (prediction,), (window,) = predict(factory.setup, factory.objective(), record), record.of("impact")

@@ -102,6 +102,20 @@ def test_the_jump_is_the_largest_within_fifteen_milliseconds() -> None:
     assert metrics.peak_jump == metrics.peak_jump_max == pytest.approx(0.5)
 
 
+def test_the_jump_is_measured_until_the_last_contact_has_landed() -> None:
+    v, impulse = np.zeros((1000, 9)), np.zeros((1000, 3))
+    # The last contact touches 28 ms after the first contact, so the interval contains the ticks 200 to 242.
+    v[200:, 3], v[215:243, 4], v[243:, 5] = 0.3, 0.4, 9.0
+    impulse[210:], impulse[235:], impulse[243:] = 1.0, 3.0, 50.0
+    setup = shared_setup("aerial-vertical")
+    series = by_hand(setup, 1000, v=v, impulse=impulse)
+    for landing, jump, factor in ((0.0, 0.3, 1.0), (0.028, 0.5, 3.0)):
+        load = impact_load(setup, series, Window("impact", 0, 0.2, 0.5, True, landing))
+        assert load.jump == pytest.approx(jump)
+        assert load.impulse == pytest.approx(factor * abs(setup.scenario.normal.sum()))
+        assert load.base_angular == pytest.approx(jump)
+
+
 def test_the_jump_begins_at_the_last_tick_before_the_touch() -> None:
     setup = shared_setup("aerial-vertical")
     v = np.arange(1000)[:, None] * np.ones(9)

@@ -52,8 +52,7 @@ def drop(law: ContactLaw, q: Vector, speed: float = 0.5, timestep: float = 2.5e-
     for _ in range(60):
         world.step(ActuatorCommand(np.zeros(3), NONE), round(1e-3 / timestep))
         recorder.take(rest, 0.0, 0.0)
-    touch = recorder.first_touch(0.0, np.inf)
-    assert touch is not None
+    (touch,) = recorder.first_touches(0.0, np.inf)
     run = Run(recorder.series(), (Window("impact", 0, touch, touch + 0.03, True),))
     (prediction,) = predict(setup, objective, run)
     return prediction, run, setup

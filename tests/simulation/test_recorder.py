@@ -69,12 +69,12 @@ def test_a_lasting_touch_is_reported_once() -> None:
         recorder.take(command(), 0.0, 0.0)
         if k == 4:
             # The time of the first touch does not depend on how ticks are divided into recorded blocks.
-            assert recorder.first_touch(0.0, 1.0) == 0.0025
-    assert recorder.first_touch(0.0, 1.0) == 0.0025
+            assert recorder.first_touches(0.0, 1.0) == [0.0025]
+    assert recorder.first_touches(0.0, 1.0) == [0.0025]
     # A touch that began before the interval is ignored.
-    assert recorder.first_touch(0.003, 0.007) is None
-    assert recorder.first_touch(0.003, 1.0) == 0.0072
-    assert recorder.first_touch(0.0, 0.002) is None and recorder.first_touch(0.0025, 0.0026) == 0.0025
+    assert recorder.first_touches(0.003, 0.007) == []
+    assert recorder.first_touches(0.003, 1.0) == [0.0072]
+    assert recorder.first_touches(0.0, 0.002) == [] and recorder.first_touches(0.0025, 0.0026) == [0.0025]
     series = recorder.series()
     np.testing.assert_array_equal(series.touching, [0, 0, 1, 1, 1, 0, 0, 1, 1])
     np.testing.assert_array_equal(series.peak, 9.0 * series.touching)

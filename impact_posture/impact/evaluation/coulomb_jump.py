@@ -58,12 +58,12 @@ def coulomb_jump(objective: WorstCaseObjective, q: Array, rebound: float) -> Cou
     return CoulombJump.of(jump, impulse, objective.oracle.n, objective.contact.friction, impact.slip)
 
 
-def coulomb_jumps(objective: WorstCaseObjective, q: Array, speed: float) -> tuple[CoulombJump, ...] | None:
+def coulomb_jumps(objective: WorstCaseObjective, q: Array, speed: float | Array) -> tuple[CoulombJump, ...] | None:
     """Return the jump of a plastic impact of all contacts at once, as one entry per contact.
 
-    Every contact point approaches along its normal at ``speed``, m/s.  The entries differ only in impulse, friction
-    and slip; all have the same velocity jump.  Return ``None`` if the contacts can pull, or if the iteration does not
-    converge.
+    Every contact point approaches along its normal at ``speed``, m/s; an array of shape (m,) gives each contact its
+    own speed.  The entries differ only in impulse, friction and slip; all have the same velocity jump.  Return
+    ``None`` if the contacts can pull, or if the iteration does not converge.
     """
     if objective.bilateral:
         return None
@@ -71,12 +71,13 @@ def coulomb_jumps(objective: WorstCaseObjective, q: Array, speed: float) -> tupl
     J, normals = np.vstack([oracle.J for oracle in oracles]), np.array([oracle.n for oracle in oracles])
     friction = np.array([oracle.contact.friction for oracle in oracles])
     responses = objective.oracle.at(q).solve(J.T)
-    B = J @ responses
-    p = contact_impulses(B, -normals, normals, friction)
+    B, fastest = J @ responses, float(np.max(speed))
+    before = -normals * np.broadcast_to(speed / fastest, len(normals))[:, None]
+    p = contact_impulses(B, before, normals, friction)
     if p is None:
         return None
-    after = (B @ p.ravel()).reshape(p.shape) - normals
+    after = (B @ p.ravel()).reshape(p.shape) + before
     slips = after - normals * (after * normals).sum(1, keepdims=True)
-    jump = weighed_jump(objective, speed * (responses @ p.ravel()), speed * p[0])
-    each = zip(speed * p, normals, friction, slips, strict=True)
+    jump = weighed_jump(objective, fastest * (responses @ p.ravel()), fastest * p[0])
+    each = zip(fastest * p, normals, friction, slips, strict=True)
     return tuple(CoulombJump.of(jump, impulse, n, float(mu), slip) for impulse, n, mu, slip in each)

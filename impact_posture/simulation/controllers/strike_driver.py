@@ -42,10 +42,10 @@ class StrikeDriver(Driver):
         points = [Point(shape.frame, shape.offset) for shape in scenario.shapes if shape.frame in frames]
         self._state = State(setup.robot, dict.fromkeys((*self.controller.formulation.points, *points)))
         here = self._state.update(path.q[-1], None)
-        J = np.mean([here.at(point).jacobian[:3] for point in points], axis=0)
+        approach = np.array([-scenario.normal @ here.at(point).jacobian[:3] for point in points])
         rotors = setup.robot.spec.propulsion
         self.path, self._now = path, 0.0
-        self._reference = PathReference(path, -scenario.normal @ J, rotors.lag if rotors else 0.0)
+        self._reference = PathReference(path, approach, rotors.lag if rotors else 0.0)
 
     def reset(self, q: Array) -> Command:
         self._reference.reset()
