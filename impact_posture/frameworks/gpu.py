@@ -10,6 +10,7 @@ import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -48,6 +49,23 @@ def load(
     return BatchMetric(ImpactGradient.load(path, robot=robot, frame=frame, free=free), folder)
 
 
+@dataclass(frozen=True)
+class Kernel:
+    """A CUDA kernel on one GPU, and how it is launched.
+
+    Attributes:
+        function: The kernel; ``function.ptr`` is its ``CUfunction``.
+        block: Number of threads in a block.
+        rows: Number of rows that a block computes.
+        shared: Dynamic shared memory of a block, in bytes.
+    """
+
+    function: Any
+    block: int
+    rows: int
+    shared: int
+
+
 class BatchMetric:
     """``H`` and the objective of an export, with gradients, for many configurations.
 
@@ -73,7 +91,7 @@ class BatchMetric:
             # An earlier version wrote this export.
             raise SpecError("does not name the entries of q", where=f"{prefix}.json", hint="run codegen again")
         self._joints = tuple(_joints(names))
-        self._kernels: dict[tuple[str, int], Any] = {}
+        self._kernels: dict[tuple[str, int], Kernel] = {}
 
     def value_and_gradient(self, q: Any, n: Any, *, in_q: bool = False) -> tuple[Any, Any]:
         """Return ``H``, shape (N,), and its gradients for configurations ``q``, shape (N, nq).
@@ -122,14 +140,7 @@ class BatchMetric:
 
     def _launch(self, cupy: Any, key: tuple[str, int], q: Any, n: Any = None) -> tuple[Any, Any]:
         """Run a CUDA kernel; ``key`` is the name of its function and the number of the current GPU."""
-        if (kernel := self._kernels.get(key)) is None:
-            header = self._folder / f"{self.gradient.manifest['prefix']}.cuh"
-            if not header.is_file():
-                raise InputError("has no CUDA code", where=str(self._folder), hint="export it with `cuda`")
-            expression = f"{self.gradient.symbols[key[0]]}_kernel<{BLOCK_THREADS}>"
-            code, options = read_text(header), ("-std=c++17",)
-            module = cupy.RawModule(code=code, options=options, backend="nvrtc", name_expressions=(expression,))
-            kernel = self._kernels[key] = module.get_function(expression)
+        kernel = self.kernel(*key)
         count, normals = len(q), list[Any]()
         if n is not None:
             normals = [cupy.ascontiguousarray(n), np.int32(n.size // 3)]
@@ -137,8 +148,30 @@ class BatchMetric:
         grad = cupy.empty((count, self.gradient.nv), dtype=self.gradient.dtype)
         if count:
             # The last argument is a null pointer in place of the array of return codes.
-            kernel((-(-count // BLOCK_THREADS),), (BLOCK_THREADS,), (q, *normals, np.int32(count), value, grad, 0))
+            arguments = (q, *normals, np.int32(count), value, grad, 0)
+            kernel.function((-(-count // kernel.rows),), (kernel.block,), arguments, kernel.shared)
         return value, grad
+
+    def kernel(self, name: str, device: int) -> Kernel:
+        """Return the kernel of the function ``eval`` or ``objective`` for the GPU with the number ``device``.
+
+        The first call compiles the kernel.
+
+        Raises:
+            InputError: CuPy is not installed, or the export has no CUDA code.
+        """
+        if (kernel := self._kernels.get((name, device))) is None:
+            cupy = import_extra("cupy", "cuda", "CuPy")
+            header = self._folder / f"{self.gradient.manifest['prefix']}.cuh"
+            if not header.is_file():
+                raise InputError("has no CUDA code", where=str(self._folder), hint="export it with `cuda`")
+            expression = f"{self.gradient.symbols[name]}_kernel<{BLOCK_THREADS}>"
+            code, options = read_text(header), ("-std=c++17",)
+            with cupy.cuda.Device(device):
+                module = cupy.RawModule(code=code, options=options, backend="nvrtc", name_expressions=(expression,))
+                function = module.get_function(expression).kernel
+            kernel = self._kernels[name, device] = Kernel(function, BLOCK_THREADS, BLOCK_THREADS, 0)
+        return kernel
 
     def normalized(self, xp: Any, q: Any) -> tuple[Any, Any]:
         """Return ``u(q)``, with normalized quaternions and cosine-sine pairs, and ``u(q)/q``, shape (N, nq).

@@ -1,13 +1,15 @@
 """H and the objective of an export as differentiable functions of JAX.
 
-Programs that JAX compiles call the C code directly (``jax.ffi``), on all CPU cores.  Arrays on a GPU are copied to
-the CPU and back.
+Programs that JAX compiles call the C code directly (``jax.ffi``), on all CPU cores.  On an NVIDIA GPU, they launch
+the CUDA kernels of the export, which CuPy compiles.  Without CuPy or CUDA code, arrays on a GPU are copied to the CPU
+and back.
 """
 
 from __future__ import annotations
 
 import ctypes
-from functools import cache
+from contextlib import suppress
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,12 +23,15 @@ from impact_posture.system.optional_package import import_extra
 if TYPE_CHECKING:
     from impact_posture.robot.robot import Robot
 
+# Kernels in compiled programs.
+_KEPT: list[Any] = []
+
 
 def load(path: str | Path, *, robot: Robot | None = None, frame: str | None = None, free: bool = False) -> JaxMetric:
     """Load an export for JAX; arguments and errors are the same as in :meth:`ImpactGradient.load`.
 
     Raises:
-        InputError: JAX is not installed, or its version lacks ``jax.ffi``.
+        InputError: JAX is not installed, or its version is older than 0.8.
         CompilerError: The function that JAX calls cannot be compiled.
     """
     return JaxMetric(gpu.load(path, robot=robot, frame=frame, free=free))
@@ -68,12 +73,34 @@ class JaxMetric:
             raise InputError(f"has shape {q.shape}", where="q", hint=f"give shape (…, {nq})")
         return q.astype(self._jax.numpy.result_type(q, float))
 
-    def _foreign_call(self, q: Any, *n: Any) -> Any:
-        gradient = self.batch.gradient
-        # The address is valid in this process only, but so is the trace that contains it.
-        function = ctypes.cast(gradient.batch_function("eval" if n else "objective"), ctypes.c_void_p).value or 0
-        call = self._jax.ffi.ffi_call(self._target, self._results(q), vmap_method="broadcast_all")
-        return call(q, *n, function=np.int64(function), single=np.int32(gradient.dtype == np.float32))
+    def _foreign_call(self, attributes: dict[str, Any], q: Any, *n: Any) -> Any:
+        """Call the C code on the CPU, or the kernel on a GPU, in the number type of the export."""
+        jax, dtype = self._jax, self.batch.gradient.dtype
+        # Without this context, JAX may turn double into float.
+        with jax.enable_x64(True):
+            call = jax.ffi.ffi_call(self._target, self._results(q, dtype), vmap_method="broadcast_all")
+            results = call(*(jax.lax.convert_element_type(array, dtype) for array in (q, *n)), **attributes)
+            return [jax.lax.convert_element_type(array, q.dtype) for array in results]
+
+    def _attributes(self, name: str) -> dict[str, Any]:
+        """Return what the C code that JAX calls needs: the C function ``name``, its kernels, and their launch.
+
+        The addresses are valid in this process only, but so is the trace that contains them.
+        """
+        kernels, launch = list[gpu.Kernel](), 0
+        if gpus := _gpus(self._jax):
+            with suppress(InputError):
+                kernels = [self.batch.kernel(name, device) for device in range(max(gpus) + 1)]
+                launch = _address(_cuda_driver().cuLaunchKernel)
+        # A compiled program may be called after the metric is deleted.
+        _KEPT.extend(kernels)
+        shape = kernels[0] if kernels else gpu.Kernel(None, 1, 1, 0)
+        numbers = {
+            "batch": _address(self.batch.gradient.batch_function(name)), "launch": launch, "block": shape.block,
+            "rows": shape.rows, "shared": shape.shared,
+        }  # fmt: skip
+        addresses = np.array([kernel.function.ptr for kernel in kernels] or [0], dtype=np.int64)
+        return {"kernels": addresses} | {key: np.int64(number) for key, number in numbers.items()}
 
     def _callback(self, q: Any, *n: Any) -> Any:
         call = self.batch.value_and_gradient if n else self.batch.objective
@@ -83,11 +110,11 @@ class JaxMetric:
             shape = arrays[0].shape[:-1]
             return value.reshape(shape), grad.reshape(*shape, -1)
 
-        return self._jax.pure_callback(on_host, self._results(q), q, *n, vmap_method="broadcast_all")
+        return self._jax.pure_callback(on_host, self._results(q, q.dtype), q, *n, vmap_method="broadcast_all")
 
-    def _results(self, q: Any) -> list[Any]:
+    def _results(self, q: Any, dtype: Any) -> list[Any]:
         shapes = q.shape[:-1], (*q.shape[:-1], self.batch.gradient.nv)
-        return [self._jax.ShapeDtypeStruct(shape, q.dtype) for shape in shapes]
+        return [self._jax.ShapeDtypeStruct(shape, dtype) for shape in shapes]
 
     def _differentiable(self) -> Any:
         """Return the function ``(q, n)`` → ``H``, or the function ``q`` → objective."""
@@ -98,7 +125,10 @@ class JaxMetric:
             single = jax.numpy.promote_types(q.dtype, jax.numpy.float32)
             rows, *normals = (array.reshape(-1, array.shape[-1]).astype(single) for array in (q, *n))
             rows, scales = self.batch.normalized(jax.numpy, rows)
-            value, grad = jax.lax.platform_dependent(rows, *normals, cpu=self._foreign_call, default=self._callback)
+            attributes = self._attributes("eval" if n else "objective")
+            call = partial(self._foreign_call, attributes)
+            on_gpu = call if attributes["launch"] else self._callback
+            value, grad = jax.lax.platform_dependent(rows, *normals, cpu=call, cuda=on_gpu, default=self._callback)
             grad = self.batch.in_coordinates(jax.numpy, rows, scales, grad)
             return value.reshape(q.shape[:-1]).astype(q.dtype), grad.reshape(q.shape).astype(q.dtype)
 
@@ -119,15 +149,36 @@ class JaxMetric:
         return function
 
 
+def _gpus(jax: Any) -> list[int]:
+    """Return the numbers of the NVIDIA GPUs that JAX uses in this process."""
+    try:
+        return [device.local_hardware_id for device in jax.local_devices(backend="cuda")]
+    except RuntimeError:
+        # JAX has no such backend.
+        return []
+
+
+def _cuda_driver() -> ctypes.CDLL:
+    return ctypes.CDLL("libcuda.so.1")
+
+
+def _address(function: Any) -> int:
+    return ctypes.cast(function, ctypes.c_void_p).value or 0
+
+
 @cache
 def _target() -> str:
-    """Compile the function that JAX calls, register it, and return its name."""
-    ffi = import_extra("jax.ffi", "jax", "a version of JAX with jax.ffi")
+    """Compile the functions that JAX calls, register them, and return their name."""
+    ffi = import_extra("jax.ffi", "jax", "JAX 0.8")
+    if not hasattr(import_extra("jax"), "enable_x64"):
+        raise InputError("is older than 0.8", where="JAX", hint="pip install 'impact-posture[jax]'")
     include, name = Path(ffi.include_dir()), "impact_posture_batch"
     header = (include / "xla" / "ffi" / "api" / "c_api.h").read_text(encoding="utf-8")
     library = cache_folder("xla") / f"lib{source_key([header], 'frameworks')}.so"
     if not is_cached(library):
         # The header needs C11.
         build_library(Path(__file__).parent / "c", "xla_batch", library, ("-std=c11", f"-I{include}"))
-    ffi.register_ffi_target(name, ffi.pycapsule(getattr(load_library(library), name)), platform="cpu")
+    functions = load_library(library)
+    for platform, function in {"cpu": name, "CUDA": "impact_posture_launch"}.items():
+        ffi.register_ffi_target(name, ffi.pycapsule(getattr(functions, function)), platform=platform)
     return name

@@ -1,11 +1,9 @@
-"""Batches of H and of the objective: on all cores, in PyTorch, in JAX, and by CUDA kernels compiled as C++."""
+"""Batches of H and of the objective: on all cores, in PyTorch, and by CUDA kernels compiled as C++."""
 
 from __future__ import annotations
 
 import ctypes
 import sys
-from dataclasses import dataclass
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,45 +12,12 @@ import pinocchio as pin
 import pytest
 
 import impact_posture as ip
-from impact_posture.codegen.export import Export, write_export
-from impact_posture.codegen.self_test import sample_postures
 from impact_posture.errors import InputError, SpecError
-from impact_posture.impact.impact_contact import ImpactContact
-from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from tests.codegen.test_cuda import on_host
-from tests.support.tools import need_compiler
-from tests.support.urdfs import joint, link, load
+from tests.frameworks.conftest import N, Sample
 
-N = np.array([0.0, 0.6, 0.8])
 # A posture of the robot of ``sample``, written with integers.
 WHOLE = [[0] * 6 + [1] + [0] * 2 + [1, 0] + [1, 0] + [0]]
-
-
-@dataclass(frozen=True)
-class Sample:
-    objective: WorstCaseObjective
-    written: Export
-    q: Any
-
-    @property
-    def out(self) -> Path:
-        return self.written.out
-
-
-@pytest.fixture(scope="module")
-def sample(tmp_path_factory: pytest.TempPathFactory) -> Sample:
-    """A floating robot with a planar, a continuous and a revolute joint, and postures with batches for threads."""
-    need_compiler()
-    folder = tmp_path_factory.mktemp("frameworks")
-    robot = load(
-        folder, link("base", 3.0, "0.1 0 0"), link("a", 1.0, "0 0.1 0.2"), link("b", 0.7, "0 0 0.2"),
-        link("tip", 0.4, "0.1 0 0.1"), joint("slide", "base a", "0 0 1", kind="planar", more=""),
-        joint("spin", "a b", at="0 0 0.3", kind="continuous"), joint("bend", "b tip", "1 0 0", at="0 0 0.4"),
-        root="free-flyer",
-    )  # fmt: skip
-    objective = WorstCaseObjective(robot, ImpactContact("tip", N, (0, 0, 0.1)), kind="effective-mass")
-    written = write_export([objective], folder / "out", prefix="small", cuda=True, build=True)
-    return Sample(objective, written, np.array(sample_postures(robot, 600, 5)))
 
 
 def slopes(function: Any, q: Any) -> Any:
@@ -129,12 +94,13 @@ class Cupy:
         return self
 
     def get_function(self, expression: str) -> Any:
+        """Return a kernel whose ``ptr`` is the number of a C++ function: 1 for eval, 2 for the objective."""
         name, threads = expression.removesuffix(">").split("_kernel<")
         function = getattr(self.library, f"{name}_rows" if name.endswith("eval") else f"{name}_batch")
 
-        def kernel(grid: Any, block: Any, arguments: Any) -> None:
+        def kernel(grid: Any, block: Any, arguments: Any, shared: int) -> None:
             q, *normals, count, value, grad, status = arguments
-            assert grid[0] * block[0] >= count and block[0] == int(threads) and status == 0
+            assert grid[0] * block[0] >= count and block[0] == int(threads) and (status, shared) == (0, 0)
             pointers = [ctypes.c_void_p(array.ctypes.data) for array in (q, *normals[:1], value, grad)]
             pointers.insert(-2, ctypes.c_int(count))
             if normals:
@@ -142,7 +108,8 @@ class Cupy:
                 pointers.append(ctypes.c_void_p(0))
             function(*pointers)
 
-        return kernel
+        kernel.ptr = 1 if name.endswith("eval") else 2
+        return SimpleNamespace(kernel=kernel)
 
 
 def test_arrays_on_a_gpu_call_the_kernels(sample: Sample, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -213,71 +180,3 @@ def test_torch_differentiates(sample: Sample) -> None:
         metric(q, N).sum().backward()
         optimizer.step()
     assert (metric(q, N) < first).all()
-
-
-# ---- JAX ----------------------------------------------------------------------------------------------------------
-
-
-def jax_module() -> Any:
-    return pytest.importorskip("jax", reason="needs JAX: pip install jax", exc_type=ImportError)
-
-
-def near(values: Any, expected: Any, digits: float = 1e-13) -> None:
-    np.testing.assert_allclose(values, expected, rtol=0, atol=digits * np.abs(expected).max())
-
-
-def test_jax_transforms(sample: Sample) -> None:
-    jax = jax_module()
-    metric = ip.jax.load(sample.out)
-    with jax.enable_x64(True):
-        # Enough rows for several threads.
-        q, n = jax.numpy.asarray(sample.q), jax.numpy.asarray(N)
-        H, grad = metric.batch.value_and_gradient(sample.q, N, in_q=True)
-        near(metric(q, n), H)
-        near(jax.jit(jax.vmap(metric, (0, None)))(q, n), H)
-        near(jax.jit(jax.vmap(jax.grad(metric), (0, None)))(q, n), grad)
-        near(jax.vmap(jax.jit(jax.vmap(metric)))(q.reshape(20, 30, -1), np.tile(N, (20, 30, 1))).ravel(), H)
-        change = jax.numpy.ones_like(q)
-        _, along = jax.jvp(lambda at: metric(at, n), (q,), (change,))
-        near(along, grad.sum(axis=1))
-        mass, slope = metric.batch.objective(sample.q, in_q=True)
-        value, back = jax.jit(jax.vmap(jax.value_and_grad(metric.objective)))(q)
-        near(value, mass)
-        near(back, slope)
-        assert metric(q[:0], n).shape == (0,)
-        assert np.isnan(metric(q.at[300, 0].set(np.nan), n)).nonzero()[0].tolist() == [300]
-        ours, _ = metric.batch.objective(q)
-        assert isinstance(ours, jax.Array)
-        with pytest.raises(InputError, match="derivative with respect to n"):
-            jax.grad(metric, argnums=1)(q[0], n)
-    half = metric(np.float32(sample.q), N)
-    assert half.dtype == np.float32
-    near(half, H, 1e-5)
-    for whole in (WHOLE, jax.numpy.asarray(WHOLE, dtype=jax.numpy.bfloat16)):
-        assert float(metric(whole, N)[0]) == pytest.approx(of_oracle(sample, np.array(WHOLE[0], float)), rel=0.01)
-    with pytest.raises(InputError, match="give shape"):
-        metric(sample.q[:, 1:], N)
-
-
-def test_jax_copies_arrays_of_a_gpu(sample: Sample, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Call the functions for other devices, which compute the same numbers on the CPU."""
-    jax = jax_module()
-    metric = ip.jax.load(sample.out)
-    H, grad = metric.batch.value_and_gradient(sample.q, N, in_q=True)
-    monkeypatch.setattr(metric, "_foreign_call", metric._callback)
-    with jax.enable_x64(True):
-        value, back = jax.jit(jax.vmap(jax.value_and_grad(metric), (0, None)))(sample.q, N)
-        near(value, H)
-        near(back, grad)
-
-
-def test_jax_calls_exports_in_float(sample: Sample, tmp_path: Path) -> None:
-    jax = jax_module()
-    write_export([sample.objective], tmp_path, prefix="single", single=True, build=True)
-    metric = ip.jax.load(tmp_path)
-    H, _ = metric.batch.value_and_gradient(sample.q, N)
-    with jax.enable_x64(True):
-        value = metric(sample.q, N)
-        assert value.dtype == float
-        near(value, H, 1e-5)
-    near(metric(np.float32(sample.q), N), H, 1e-5)

@@ -1,92 +1,84 @@
 /*
- * Call the batch functions of an export from programs that XLA compiles.
+ * Call the batch functions and the kernels of an export from programs that XLA compiles.
  *
- * Arguments and results of a call are arrays of double or float, whose last axis is a row, and other axes are a batch:
- * q, then n if the function has a normal; value, gradient.  Attributes of a call, sorted by name as XLA sorts them:
- *   function  address of <stem>_eval_batch or <stem>_objective_batch
- *   single    whether this function computes in float
+ * Arguments and results of a call are arrays of the number type of the export, whose last axis is a row, and other
+ * axes are a batch: q, then n if the function has a normal; value, gradient.
  */
+#include <limits.h>
 #include <stdatomic.h>
 #include <stdlib.h>
 
 #include "xla/ffi/api/c_api.h"
 
-/* Number of rows that a thread computes between two looks at the number of rows that are left. */
+/*
+ * Attributes of a call, in the order of their names, which is the order of XLA.  The first is for the CPU:
+ *   batch    address of <stem>_eval_batch or <stem>_objective_batch
+ * The others are for GPUs:
+ *   block    threads in a block of the kernel
+ *   kernels  array: the kernel <stem>_eval_kernel or <stem>_objective_kernel (CUfunction) for each GPU
+ *   launch   address of cuLaunchKernel
+ *   rows     rows that a block computes
+ *   shared   bytes of dynamic shared memory of a block
+ */
+enum { BATCH, BLOCK, KERNELS, LAUNCH, BLOCK_ROWS, SHARED };
+
+/* Number of rows that a thread of the CPU computes between two looks at the number of rows that are left. */
 enum { ROWS = 256 };
 
 typedef struct {
   intptr_t function;
-  int single, other_type;
   int64_t count;
-  /* q, n, value and gradient: array, entries per row, and bytes per entry. */
+  /* q, n, value and gradient: array, and bytes per row. */
   char *data[4];
-  int64_t width[4], size;
+  int64_t width[4];
   atomic_llong next;
-  atomic_int threads, running;
+  atomic_int running;
   const XLA_FFI_Api *api;
   XLA_FFI_Future *future;
 } Work;
 
-static int64_t scratch_size(const Work *work)
+/* Return whether XLA asks for the version of this code instead of a computation, and answer. */
+static int answered(const XLA_FFI_CallFrame *frame, XLA_FFI_Handler_Traits traits)
 {
-  const int64_t row = work->width[0] + work->width[1] + work->width[2] + work->width[3];
-  return work->other_type ? ROWS * row * (int64_t)sizeof(double) : 0;
+  if (frame->extension_start != NULL && frame->extension_start->type == XLA_FFI_Extension_Metadata) {
+    XLA_FFI_Metadata *metadata = ((XLA_FFI_Metadata_Extension *)frame->extension_start)->metadata;
+    metadata->api_version.major_version = XLA_FFI_API_MAJOR;
+    metadata->api_version.minor_version = XLA_FFI_API_MINOR;
+    metadata->traits = traits;
+    return 1;
+  }
+  return 0;
 }
 
-/* Convert double to float, or float to double. */
-static void convert(void *to, const void *from, int to_single, int64_t count)
+static int64_t number(const XLA_FFI_CallFrame *frame, int attribute)
 {
-  int64_t i;
-  for (i = 0; i < count; ++i) {
-    if (to_single) {
-      ((float *)to)[i] = (float)((const double *)from)[i];
-    } else {
-      ((double *)to)[i] = ((const float *)from)[i];
-    }
-  }
+  return *(int64_t *)((XLA_FFI_Scalar *)frame->attrs.attrs[attribute])->value;
 }
 
-static void compute(const Work *work, int64_t first, int rows, char *scratch)
+static Work work_of(const XLA_FFI_CallFrame *frame)
 {
-  char *given[4], *at[4];
-  int k;
-  for (k = 0; k < 4; ++k) {
-    given[k] = at[k] = work->data[k] + first * work->width[k] * work->size;
-    if (work->other_type) {
-      at[k] = scratch;
-      scratch += rows * work->width[k] * (int64_t)sizeof(double);
-      if (k < 2) {
-        convert(at[k], given[k], work->single, rows * work->width[k]);
-      }
+  const int64_t normals = frame->args.size - 1;
+  Work work = {0};
+  int64_t k, i;
+  work.api = frame->api;
+  work.count = 1;
+  for (k = 0; k <= normals + 2; ++k) {
+    const XLA_FFI_Buffer *buffer = k <= normals ? frame->args.args[k] : frame->rets.rets[k - normals - 1];
+    const int64_t place = k <= normals ? k : k - normals + 1;
+    const int64_t size = buffer->dtype == XLA_FFI_DataType_F32 ? sizeof(float) : sizeof(double);
+    work.data[place] = buffer->data;
+    work.width[place] = place == 2 ? size : size * buffer->dims[buffer->rank - 1];
+    for (i = 0; place == 2 && i < buffer->rank; ++i) {
+      work.count *= buffer->dims[i];
     }
   }
-  /* The status is not needed, because rows that cannot be computed are NaN. */
-  if (work->width[1] > 0) {
-    ((int (*)(void *, void *, int, void *, void *))work->function)(at[0], at[1], rows, at[2], at[3]);
-  } else {
-    ((int (*)(void *, int, void *, void *))work->function)(at[0], rows, at[2], at[3]);
-  }
-  for (k = 2; work->other_type && k < 4; ++k) {
-    convert(given[k], at[k], !work->single, rows * work->width[k]);
-  }
+  return work;
 }
 
-/* Compute rows until none is left.  The last thread reports the end and frees the work. */
-static void run(void *argument)
+static XLA_FFI_Error *error(const XLA_FFI_Api *api, const char *message, XLA_FFI_Error_Code code)
 {
-  Work *work = argument;
-  char *scratch = (char *)(work + 1) + atomic_fetch_add(&work->threads, 1) * scratch_size(work);
-  int64_t first;
-  while ((first = atomic_fetch_add(&work->next, ROWS)) < work->count) {
-    compute(work, first, work->count - first < ROWS ? (int)(work->count - first) : ROWS, scratch);
-  }
-  if (atomic_fetch_sub(&work->running, 1) == 1) {
-    if (work->future != NULL) {
-      XLA_FFI_Future_SetAvailable_Args end = {XLA_FFI_Future_SetAvailable_Args_STRUCT_SIZE, NULL, work->future};
-      work->api->XLA_FFI_Future_SetAvailable(&end);
-    }
-    free(work);
-  }
+  XLA_FFI_Error_Create_Args created = {XLA_FFI_Error_Create_Args_STRUCT_SIZE, NULL, message, code};
+  return api->XLA_FFI_Error_Create(&created);
 }
 
 /* Free an error, and return whether there was one. */
@@ -99,32 +91,69 @@ static int failed(const XLA_FFI_Api *api, XLA_FFI_Error *error)
   return error != NULL;
 }
 
-/* Start the work on the threads of XLA. */
-static XLA_FFI_Error *start(XLA_FFI_CallFrame *frame, const Work *sizes)
+/* ---- on the CPU ------------------------------------------------------------------------------------------------ */
+
+static void compute(const Work *work, int64_t first, int rows)
+{
+  char *at[4];
+  int k;
+  for (k = 0; k < 4; ++k) {
+    at[k] = work->data[k] + first * work->width[k];
+  }
+  /* The status is not needed, because rows that cannot be computed are NaN. */
+  if (work->width[1] > 0) {
+    ((int (*)(void *, void *, int, void *, void *))work->function)(at[0], at[1], rows, at[2], at[3]);
+  } else {
+    ((int (*)(void *, int, void *, void *))work->function)(at[0], rows, at[2], at[3]);
+  }
+}
+
+/* Compute rows until none is left.  The last thread reports the end and frees the work. */
+static void run(void *argument)
+{
+  Work *work = argument;
+  int64_t first;
+  while ((first = atomic_fetch_add(&work->next, ROWS)) < work->count) {
+    compute(work, first, work->count - first < ROWS ? (int)(work->count - first) : ROWS);
+  }
+  if (atomic_fetch_sub(&work->running, 1) == 1) {
+    if (work->future != NULL) {
+      XLA_FFI_Future_SetAvailable_Args end = {XLA_FFI_Future_SetAvailable_Args_STRUCT_SIZE, NULL, work->future};
+      work->api->XLA_FFI_Future_SetAvailable(&end);
+    }
+    free(work);
+  }
+}
+
+/* Compute all rows on the threads of XLA. */
+XLA_FFI_Error *impact_posture_batch(XLA_FFI_CallFrame *frame)
 {
   const XLA_FFI_Api *api = frame->api;
-  int64_t threads = (sizes->count + ROWS - 1) / ROWS, most = 1;
+  int64_t threads, most = 1;
   XLA_FFI_ThreadPool_NumThreads_Args pool = {XLA_FFI_ThreadPool_NumThreads_Args_STRUCT_SIZE, NULL, frame->ctx, &most};
   XLA_FFI_ThreadPool_Schedule_Args task = {XLA_FFI_ThreadPool_Schedule_Args_STRUCT_SIZE, NULL, frame->ctx, run};
   XLA_FFI_Future_Create_Args future = {XLA_FFI_Future_Create_Args_STRUCT_SIZE};
   Work *work;
+  if (answered(frame, 0)) {
+    return NULL;
+  }
+  work = malloc(sizeof(Work));
+  if (work == NULL) {
+    return error(api, "no memory is left", XLA_FFI_Error_Code_RESOURCE_EXHAUSTED);
+  }
+  *work = work_of(frame);
+  work->function = (intptr_t)number(frame, BATCH);
+  threads = (work->count + ROWS - 1) / ROWS;
   if (threads > 1 && failed(api, api->XLA_FFI_ThreadPool_NumThreads(&pool))) {
     most = 1;
   }
   threads = most < threads ? most : threads;
   threads = threads < 1 ? 1 : threads;
-  work = malloc(sizeof(Work) + (size_t)(threads * scratch_size(sizes)));
-  if (work == NULL) {
-    XLA_FFI_Error_Create_Args error = {
-      XLA_FFI_Error_Create_Args_STRUCT_SIZE, NULL, "no memory is left", XLA_FFI_Error_Code_RESOURCE_EXHAUSTED};
-    return api->XLA_FFI_Error_Create(&error);
-  }
-  *work = *sizes;
   if (threads > 1) {
-    XLA_FFI_Error *error = api->XLA_FFI_Future_Create(&future);
-    if (error != NULL) {
+    XLA_FFI_Error *fault = api->XLA_FFI_Future_Create(&future);
+    if (fault != NULL) {
       free(work);
-      return error;
+      return fault;
     }
     frame->future = work->future = future.future;
   }
@@ -137,31 +166,56 @@ static XLA_FFI_Error *start(XLA_FFI_CallFrame *frame, const Work *sizes)
   return NULL;
 }
 
-XLA_FFI_Error *impact_posture_batch(XLA_FFI_CallFrame *frame)
+/* ---- on a GPU -------------------------------------------------------------------------------------------------- */
+
+typedef int Launch(
+  void *kernel, unsigned grid_x, unsigned grid_y, unsigned grid_z, unsigned block_x, unsigned block_y,
+  unsigned block_z, unsigned shared, void *stream, void **arguments, void **extra);
+
+/* Start the kernel on the stream of XLA, and do not wait for its end. */
+XLA_FFI_Error *impact_posture_launch(XLA_FFI_CallFrame *frame)
 {
-  const int64_t normals = frame->args.size - 1;
-  Work sizes = {0};
-  int64_t k, i;
-  if (frame->extension_start != NULL && frame->extension_start->type == XLA_FFI_Extension_Metadata) {
-    XLA_FFI_Metadata *metadata = ((XLA_FFI_Metadata_Extension *)frame->extension_start)->metadata;
-    metadata->api_version.major_version = XLA_FFI_API_MAJOR;
-    metadata->api_version.minor_version = XLA_FFI_API_MINOR;
+  XLA_FFI_Stream_Get_Args stream = {XLA_FFI_Stream_Get_Args_STRUCT_SIZE, NULL, frame->ctx};
+  XLA_FFI_DeviceOrdinal_Get_Args device = {XLA_FFI_DeviceOrdinal_Get_Args_STRUCT_SIZE, NULL, frame->ctx};
+  XLA_FFI_Error *fault;
+  void *arguments[7], *status = NULL;
+  int count, k = 0;
+  int64_t rows;
+  Work work;
+  /* Programs may capture the launch in a graph. */
+  if (answered(frame, XLA_FFI_HANDLER_TRAITS_COMMAND_BUFFER_COMPATIBLE)) {
     return NULL;
   }
-  sizes.api = frame->api;
-  sizes.function = (intptr_t)*(int64_t *)((XLA_FFI_Scalar *)frame->attrs.attrs[0])->value;
-  sizes.single = *(int32_t *)((XLA_FFI_Scalar *)frame->attrs.attrs[1])->value;
-  sizes.count = 1;
-  for (k = 0; k <= normals + 2; ++k) {
-    const XLA_FFI_Buffer *buffer = k <= normals ? frame->args.args[k] : frame->rets.rets[k - normals - 1];
-    const int64_t place = k <= normals ? k : k - normals + 1;
-    sizes.data[place] = buffer->data;
-    sizes.width[place] = place == 2 ? 1 : buffer->dims[buffer->rank - 1];
-    for (i = 0; place == 2 && i < buffer->rank; ++i) {
-      sizes.count *= buffer->dims[i];
-    }
-    sizes.size = buffer->dtype == XLA_FFI_DataType_F32 ? sizeof(float) : sizeof(double);
+  work = work_of(frame);
+  if (work.count == 0) {
+    return NULL;
   }
-  sizes.other_type = sizes.single != (sizes.size == sizeof(float));
-  return start(frame, &sizes);
+  if (work.count > INT_MAX) {
+    return error(work.api, "a kernel computes at most 2147483647 rows", XLA_FFI_Error_Code_INVALID_ARGUMENT);
+  }
+  count = (int)work.count;
+  fault = work.api->XLA_FFI_Stream_Get(&stream);
+  if (fault == NULL) {
+    fault = work.api->XLA_FFI_DeviceOrdinal_Get(&device);
+  }
+  if (fault != NULL) {
+    return fault;
+  }
+  work.function = (intptr_t)((int64_t *)((XLA_FFI_Array *)frame->attrs.attrs[KERNELS])->data)[device.device_ordinal];
+  arguments[k++] = &work.data[0];
+  if (work.width[1] > 0) {
+    arguments[k++] = &work.data[1];
+    arguments[k++] = &count;
+  }
+  arguments[k++] = &count;
+  arguments[k++] = &work.data[2];
+  arguments[k++] = &work.data[3];
+  arguments[k++] = &status;
+  rows = number(frame, BLOCK_ROWS);
+  if (((Launch *)(intptr_t)number(frame, LAUNCH))(
+        (void *)work.function, (unsigned)((work.count + rows - 1) / rows), 1, 1, (unsigned)number(frame, BLOCK), 1, 1,
+        (unsigned)number(frame, SHARED), stream.stream, arguments, NULL) != 0) {
+    return error(work.api, "cuLaunchKernel failed", XLA_FFI_Error_Code_INTERNAL);
+  }
+  return NULL;
 }
