@@ -1,15 +1,13 @@
 """H and the objective of an export as differentiable functions of JAX.
 
 Programs that JAX compiles call the C code directly (``jax.ffi``), on all CPU cores.  On an NVIDIA GPU, they launch
-the CUDA kernels of the export, which CuPy compiles.  Without CuPy or CUDA code, arrays on a GPU are copied to the CPU
-and back.
+the CUDA kernels of the export, which CuPy compiles.  No array leaves the GPU.
 """
 
 from __future__ import annotations
 
 import ctypes
-from contextlib import suppress
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -73,13 +71,14 @@ class JaxMetric:
             raise InputError(f"has shape {q.shape}", where="q", hint=f"give shape (…, {nq})")
         return q.astype(self._jax.numpy.result_type(q, float))
 
-    def _foreign_call(self, attributes: dict[str, Any], q: Any, *n: Any) -> Any:
+    def _foreign_call(self, q: Any, *n: Any) -> Any:
         """Call the C code on the CPU, or the kernel on a GPU, in the number type of the export."""
         jax, dtype = self._jax, self.batch.gradient.dtype
         # Without this context, JAX may turn double into float.
         with jax.enable_x64(True):
-            call = jax.ffi.ffi_call(self._target, self._results(q, dtype), vmap_method="broadcast_all")
-            results = call(*(jax.lax.convert_element_type(array, dtype) for array in (q, *n)), **attributes)
+            call = jax.ffi.ffi_call(self._target, self._results(q), vmap_method="broadcast_all")
+            inputs = [jax.lax.convert_element_type(array, dtype) for array in (q, *n)]
+            results = call(*inputs, **self._attributes("eval" if n else "objective"))
             return [jax.lax.convert_element_type(array, q.dtype) for array in results]
 
     def _attributes(self, name: str) -> dict[str, Any]:
@@ -87,11 +86,14 @@ class JaxMetric:
 
         The addresses are valid in this process only, but so is the trace that contains them.
         """
-        kernels, launch = list[gpu.Kernel](), 0
+        kernels, launch, fault = list[gpu.Kernel](), 0, ""
         if gpus := _gpus(self._jax):
-            with suppress(InputError):
+            try:
                 kernels = [self.batch.kernel(name, device) for device in range(max(gpus) + 1)]
                 launch = _address(_cuda_driver().cuLaunchKernel)
+            except InputError as error:
+                # The program may be for the CPU, so only its call on a GPU fails.
+                fault = str(error)
         # A compiled program may be called after the metric is deleted.
         _KEPT.extend(kernels)
         shape = kernels[0] if kernels else gpu.Kernel(None, 1, 1, 0)
@@ -100,21 +102,11 @@ class JaxMetric:
             "rows": shape.rows, "shared": shape.shared,
         }  # fmt: skip
         addresses = np.array([kernel.function.ptr for kernel in kernels] or [0], dtype=np.int64)
-        return {"kernels": addresses} | {key: np.int64(number) for key, number in numbers.items()}
+        return {"fault": fault, "kernels": addresses} | {key: np.int64(number) for key, number in numbers.items()}
 
-    def _callback(self, q: Any, *n: Any) -> Any:
-        call = self.batch.value_and_gradient if n else self.batch.objective
-
-        def on_host(*arrays: Any) -> tuple[Any, Any]:
-            value, grad = call(*(np.asarray(array).reshape(-1, array.shape[-1]) for array in arrays))
-            shape = arrays[0].shape[:-1]
-            return value.reshape(shape), grad.reshape(*shape, -1)
-
-        return self._jax.pure_callback(on_host, self._results(q, q.dtype), q, *n, vmap_method="broadcast_all")
-
-    def _results(self, q: Any, dtype: Any) -> list[Any]:
+    def _results(self, q: Any) -> list[Any]:
         shapes = q.shape[:-1], (*q.shape[:-1], self.batch.gradient.nv)
-        return [self._jax.ShapeDtypeStruct(shape, dtype) for shape in shapes]
+        return [self._jax.ShapeDtypeStruct(shape, self.batch.gradient.dtype) for shape in shapes]
 
     def _differentiable(self) -> Any:
         """Return the function ``(q, n)`` → ``H``, or the function ``q`` → objective."""
@@ -125,10 +117,7 @@ class JaxMetric:
             single = jax.numpy.promote_types(q.dtype, jax.numpy.float32)
             rows, *normals = (array.reshape(-1, array.shape[-1]).astype(single) for array in (q, *n))
             rows, scales = self.batch.normalized(jax.numpy, rows)
-            attributes = self._attributes("eval" if n else "objective")
-            call = partial(self._foreign_call, attributes)
-            on_gpu = call if attributes["launch"] else self._callback
-            value, grad = jax.lax.platform_dependent(rows, *normals, cpu=call, cuda=on_gpu, default=self._callback)
+            value, grad = self._foreign_call(rows, *normals)
             grad = self.batch.in_coordinates(jax.numpy, rows, scales, grad)
             return value.reshape(q.shape[:-1]).astype(q.dtype), grad.reshape(q.shape).astype(q.dtype)
 

@@ -148,16 +148,11 @@ def test_jax_launches_kernels(sample: Sample, driver: Driver) -> None:
             metric(sample.q[:2], N)
 
 
-def test_jax_copies_arrays_of_a_gpu(sample: Sample, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Call the functions for other devices, which compute the same numbers on the CPU."""
-    jax = jax_module()
-    metric = ip.jax.load(sample.out)
-    H, grad = metric.batch.value_and_gradient(sample.q, N, in_q=True)
-    monkeypatch.setattr(metric, "_foreign_call", lambda attributes, *arrays: metric._callback(*arrays))
-    with jax.enable_x64(True):
-        value, back = jax.jit(jax.vmap(jax.value_and_grad(metric), (0, None)))(sample.q, N)
-        near(value, H)
-        near(back, grad)
+def test_jax_names_missing_kernels(sample: Sample, driver: Driver) -> None:
+    (sample.out / "small.cuh").rename(sample.out / "hidden")
+    with pytest.raises(RuntimeError, match="has no CUDA code"):
+        np.asarray(ip.jax.load(sample.out)(sample.q, N))
+    (sample.out / "hidden").rename(sample.out / "small.cuh")
 
 
 def test_jax_calls_exports_in_float(sample: Sample, tmp_path: Path) -> None:

@@ -6,6 +6,7 @@
  */
 #include <limits.h>
 #include <stdatomic.h>
+#include <stdio.h>
 #include <stdlib.h>
 
 #include "xla/ffi/api/c_api.h"
@@ -15,12 +16,13 @@
  *   batch    address of <stem>_eval_batch or <stem>_objective_batch
  * The others are for GPUs:
  *   block    threads in a block of the kernel
+ *   fault    text: why there are no kernels; empty if there are kernels
  *   kernels  array: the kernel <stem>_eval_kernel or <stem>_objective_kernel (CUfunction) for each GPU
  *   launch   address of cuLaunchKernel
  *   rows     rows that a block computes
  *   shared   bytes of dynamic shared memory of a block
  */
-enum { BATCH, BLOCK, KERNELS, LAUNCH, BLOCK_ROWS, SHARED };
+enum { BATCH, BLOCK, FAULT, KERNELS, LAUNCH, BLOCK_ROWS, SHARED };
 
 /* Number of rows that a thread of the CPU computes between two looks at the number of rows that are left. */
 enum { ROWS = 256 };
@@ -177,6 +179,7 @@ XLA_FFI_Error *impact_posture_launch(XLA_FFI_CallFrame *frame)
 {
   XLA_FFI_Stream_Get_Args stream = {XLA_FFI_Stream_Get_Args_STRUCT_SIZE, NULL, frame->ctx};
   XLA_FFI_DeviceOrdinal_Get_Args device = {XLA_FFI_DeviceOrdinal_Get_Args_STRUCT_SIZE, NULL, frame->ctx};
+  const XLA_FFI_ByteSpan *reason;
   XLA_FFI_Error *fault;
   void *arguments[7], *status = NULL;
   int count, k = 0;
@@ -189,6 +192,12 @@ XLA_FFI_Error *impact_posture_launch(XLA_FFI_CallFrame *frame)
   work = work_of(frame);
   if (work.count == 0) {
     return NULL;
+  }
+  reason = frame->attrs.attrs[FAULT];
+  if (reason->len > 0) {
+    char text[512];
+    snprintf(text, sizeof text, "%.*s", (int)reason->len, reason->ptr);
+    return error(work.api, text, XLA_FFI_Error_Code_FAILED_PRECONDITION);
   }
   if (work.count > INT_MAX) {
     return error(work.api, "a kernel computes at most 2147483647 rows", XLA_FFI_Error_Code_INVALID_ARGUMENT);
