@@ -75,8 +75,11 @@ class PathSpace:
     def pulled(self, q: Array, step: Array | None = None) -> Array | None:
         """Return ``q ⊕ step`` pulled onto the constraints, or ``None`` if it does not reach them."""
         self.pulls += 1
-        projected = self.projector.project(q if step is None else np.asarray(pin.integrate(self.model, q, step))).q
-        return projected if self.valid(projected) else None
+        moved = self.projector.project(q if step is None else np.asarray(pin.integrate(self.model, q, step)))
+        # Without a violation, the posture satisfies the joint limits and all constraints onto which it was projected.
+        satisfied = moved.violation <= min(EQUALITY, INEQUALITY)
+        valid = self.projector.allows(moved.q, INEQUALITY) if satisfied else self.valid(moved.q)
+        return moved.q if valid else None
 
     def apart(self, q: Array) -> Array | None:
         """Return a valid posture near ``q``, shape (nq,), at which bodies may be too near to each other, or ``None``.

@@ -71,6 +71,11 @@ class Projector:
             jacobians.append(jacobian)
         return np.concatenate(values), np.concatenate(jacobians)
 
+    def allows(self, q: Array, tolerance: float) -> bool:
+        """Return whether the constraints that are not projected are violated by at most ``tolerance``."""
+        self.numeric.at(q)
+        return all(np.abs(c.excess(c.value(self.numeric))).max(initial=0.0) <= tolerance for c in self._free)
+
     def outside(self, q: Array, most: float = np.inf) -> float:
         """Return the sum of the violations of all constraints that are not projected.
 
