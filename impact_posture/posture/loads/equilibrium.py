@@ -138,6 +138,10 @@ class Equilibrium:
     def _even_share(self, q: Array) -> float:
         """Return the largest actuator share under nearly even forces; infinite if they do not balance the base."""
         still = self.load.torque(q, np.zeros(self.load.count), by_posture=False)
+        if not self.load.count:
+            shares = np.abs(self.rows @ still.value + self.offset)
+            balanced = shares[: self.balanced].max(initial=0.0) < _TIED
+            return float(shares[self.balanced :].max(initial=0.0)) if balanced else np.inf
         A, b, S, c = self._affine(still.value, still.by_force)
         lower, upper = self.load.lower, self.load.upper
         pushing = np.isfinite(lower) & np.isinf(upper)
@@ -185,9 +189,9 @@ class Equilibrium:
         The forces are chosen so that the largest share is as small as possible.  The result is ``None`` if the feet
         cannot balance the load.
         """
-        A, b, S, c = self._affine(load, self._by_force(q))
         if not self.load.count:
-            return c
+            return np.asarray((self.rows @ load + self.offset)[self.balanced :])
+        A, b, S, c = self._affine(load, self._by_force(q))
         optimum = self._least_share(A, b, S, c)
         return None if optimum is None else S @ optimum[0] + c
 
@@ -218,7 +222,7 @@ class Equilibrium:
         return float("inf") if optimum.x[-1] > _MOST * (1 - 1e-9) else float(optimum.x[-1])
 
     def _by_force(self, q: Array) -> Array:
-        return self.load.torque(q, np.zeros(self.load.count)).by_force
+        return self.load.torque(q, np.zeros(self.load.count), by_posture=False).by_force
 
     def _least_share(self, A: Array, b: Array, S: Array, c: Array) -> tuple[Array, float, Array] | None:
         """Solve ``min s`` with ``A z + b = 0``, ``|S z + c| ≤ s``; return z, the imbalance 0 and the multipliers."""

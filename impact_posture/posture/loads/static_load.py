@@ -102,7 +102,8 @@ class StaticLoad:
         a force that is constant in the world becomes ``f + f × δ`` if the link turns by δ.
         """
         model, data = self.model, self._data
-        pin.computeJointJacobians(model, data, q)
+        if self.sources:
+            pin.computeJointJacobians(model, data, q)
         forces = [pin.Force.Zero() for _ in range(model.njoints)]
         by_force = np.zeros((model.nv, self.count))
         turning = np.zeros((model.nv, model.nv))
