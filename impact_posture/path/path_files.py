@@ -174,5 +174,7 @@ def _trajectory(robot: Robot, path: RowInterpolation, angles: Array, note: str) 
     if robot.floating:
         lines.append("# The base floats: its pose over time is in the CSV (q:base ...).")
     lines += [note] if note else []
-    lines.append(yaml.safe_dump(message, sort_keys=False, default_flow_style=None, width=10**6))
+    # The emitter of libyaml writes the same text four times as fast, but not every installation has it.
+    dumper = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+    lines.append(yaml.dump(message, Dumper=dumper, sort_keys=False, default_flow_style=None, width=10**6))
     return "\n".join(lines)
