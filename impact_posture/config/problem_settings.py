@@ -240,7 +240,11 @@ class ProblemSettings(ImpactSettings):
     )  # fmt: skip
     base_box: Lengths = setting(BASE_BOX, "Half extents of --base box, m.", TASK, "X Y Z")
     com: bool | None = setting(
-        None, "Keep the center of mass above the feet.", LIMITS, words="from robot.toml", option="--com/--no-com"
+        None,
+        "Keep the center of mass above the feet.",
+        LIMITS,
+        words="from robot.toml; on for a fall",
+        option="--com/--no-com",
     )
     com_margin: NonNegative | None = setting(
         None, "Distance of the center of mass from the support polygon's edges, m.", LIMITS, words="from robot.toml"

@@ -18,11 +18,12 @@ from impact_posture.path.actuator_limits import ActuatorLimits
 from impact_posture.path.path_curve import PathCurve
 from impact_posture.path.path_space import PathSpace
 from impact_posture.path.row_interpolation import Moment, RowInterpolation
-from impact_posture.path.strike_spaces import StrikeSpaces, falls_freely, landed
+from impact_posture.path.strike_spaces import StrikeSpaces, landed
 from impact_posture.path.stroke import shortest_stroke
 from impact_posture.path.time_law import TimeLaw
 from impact_posture.path.timed_curve import moment, sampled
 from impact_posture.posture.constraints.clearance import Clearance
+from impact_posture.posture.formulation.landing import falls_freely
 from impact_posture.posture.program.certificate import linearized_limits
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem, equality_jacobian
 from impact_posture.robot.support_polygon import polygon_edges
@@ -109,12 +110,12 @@ def follow_through(
 
     Held joints and feet are assumed not to move.  The velocity after the impact may exceed the limits.
 
-    A robot that falls (:func:`~impact_posture.path.strike_spaces.falls_freely`) then stands on its contacts, and
-    ``limits`` are the limits of the standing robot (:func:`~impact_posture.path.strike_spaces.landed`).  After a
-    fall, only plastic impacts are considered, because the leg of a foot that rebounds presses the foot onto the
-    ground again.
+    A robot that falls (:func:`~impact_posture.posture.formulation.landing.falls_freely`) then stands on its
+    contacts, and ``limits`` are the limits of the standing robot
+    (:func:`~impact_posture.path.strike_spaces.landed`).  After a fall, only plastic impacts are considered, because
+    the leg of a foot that rebounds presses the foot onto the ground again.
     """
-    falls = falls_freely(problem)
+    falls = falls_freely(problem.objective, problem.requirements.base)
     standing, restitutions = (landed(problem, q), (0.0,)) if falls else (problem, RESTITUTIONS)
     spaces = StrikeSpaces(standing, q)
     around, cone, axes = {"": spaces}, np.deg2rad(problem.impact.normal_cone_deg), cone_axes(spaces.normals[0])

@@ -18,10 +18,11 @@ from impact_posture.path.path_timing import LimitUse, limit_use, timed
 from impact_posture.path.reachable_curve import ReachableCurve
 from impact_posture.path.row_interpolation import INTERPOLATION, RowInterpolation
 from impact_posture.path.strike import FREE_FALL, RunUp, Strike, check_strike, run_up
-from impact_posture.path.strike_spaces import falls_freely, landed
+from impact_posture.path.strike_spaces import landed
 from impact_posture.path.timed_curve import TimedCurve
 from impact_posture.posture.approach.approach_speed import ApproachSpeed
 from impact_posture.posture.approach.attainable_speed import USABLE
+from impact_posture.posture.formulation.landing import falls_freely
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem
 from impact_posture.posture.search.multistart import PostureSolution
 from impact_posture.system.arrays import Array
@@ -137,7 +138,7 @@ def posture_path(
     space, limits = PathSpace(problem), ActuatorLimits(problem.objective, start, problem.requirements)
     if strike is not None:
         check_strike(problem, strike)
-        if falls_freely(problem):
+        if falls_freely(problem.objective, problem.requirements.base):
             limits = ActuatorLimits(landed(problem, start).objective, start, problem.requirements)
         struck = _struck(solution, space, limits, strike, restitution, seed, effort)
         if isinstance(struck, PosturePath):
@@ -162,7 +163,7 @@ def fall_path(problem: ConstrainedProblem, q: Array, speed: float) -> PosturePat
         InputError: The robot does not fall, or something is in the way.
     """
     check_strike(problem, speed)
-    if not falls_freely(problem):
+    if not falls_freely(problem.objective, problem.requirements.base):
         raise InputError(
             "does not fall", where=problem.robot.name, hint="use a floating base without rotors and feet"
         )

@@ -17,10 +17,11 @@ from impact_posture.path.actuator_limits import ActuatorLimits
 from impact_posture.path.follow_through import FollowThrough
 from impact_posture.path.path_space import PathSpace
 from impact_posture.path.row_interpolation import RowInterpolation
-from impact_posture.path.strike_spaces import StrikeSpaces, falls_freely
+from impact_posture.path.strike_spaces import StrikeSpaces
 from impact_posture.path.stroke import SHORTEST, shortest_stroke
 from impact_posture.path.timed_curve import SAMPLE_TIME, TimedCurve, sampled
 from impact_posture.posture.constraints.center_of_mass_over_feet import CenterOfMassOverFeet
+from impact_posture.posture.formulation.landing import falls_freely
 from impact_posture.posture.loads.holdable import Holdable, ReachableWrench
 from impact_posture.posture.program.certificate import linearized_limits
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem
@@ -82,13 +83,14 @@ def check_strike(problem: ConstrainedProblem, speed: float) -> None:
     fault, hint = "", "leave out `strike`"
     wanted, gravity = problem.requirements, problem.robot.model.gravity.linear
     normals = np.array([single.oracle.at(problem.given).n for single in problem.impact.singles])
+    falls = falls_freely(problem.objective, wanted.base)
     turn = any(contact.normal_frame == "contact" for contact in problem.objective.contacts)
     loose = [pose for pose in (wanted.contact_pose, *wanted.other_poses) if pose in ("free", "box")]
     if loose:
         fault, hint = f"needs a held contact, but `contact_pose` is {loose[0]}", "hold it: full, position or aligned"
     elif not speed > 0:
         fault, hint = "needs an approach speed above zero", "give `speed`"
-    elif falls_freely(problem) and (turn or np.abs(normals + gravity / np.linalg.norm(gravity)).max() > _TILT):
+    elif falls and (turn or np.abs(normals + gravity / np.linalg.norm(gravity)).max() > _TILT):
         fault, hint = "needs level ground, because nothing supports the robot, so it falls", "give `support`"
     if fault:
         raise InputError(fault, where="strike", hint=hint)
@@ -201,7 +203,7 @@ def run_up(problem: ConstrainedProblem, q: Array, speed: float, limits: Actuator
     stands stays away from the edges of the feet, unless this condition limits the speed.  If active bounds limit the
     speed, the robot approaches these bounds from inside.  A robot without support falls (:func:`_fall`).
     """
-    if falls_freely(problem):
+    if falls_freely(problem.objective, problem.requirements.base):
         return _fall(problem, q, speed)
     spaces, time = StrikeSpaces(problem, q), SHORTEST[limits.rotors] / 2
     fastest: RunUp | str = "the joints cannot move the contact along the normal"

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 
 from impact_posture.dynamics.numeric import Numeric
-from impact_posture.impact.supports import resolve_supports
 from impact_posture.impact.worst_case.worst_normal import cone_axes
 from impact_posture.path.path_space import PathSpace
 from impact_posture.posture.constraints.center_of_mass_over_feet import CenterOfMassOverFeet
@@ -23,9 +22,9 @@ from impact_posture.posture.constraints.pose_constraints import (
     PositionAlong,
 )
 from impact_posture.posture.formulation.build_problem import held_support
+from impact_posture.posture.formulation.landing import falls_freely, landing_feet
 from impact_posture.posture.loads.holdable import Holdable, ReachableWrench
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem, equality_jacobian
-from impact_posture.robot.robot_spec import Support
 from impact_posture.system.arrays import Array
 
 # Largest distance, m, of a contact point inside the surface after the impact, where the point may slide along the
@@ -38,22 +37,11 @@ _POSES = (HeldPose, HeldPosition, HeldOrientation, AxisInCone)
 _AT_REST = (CenterOfMassOverFeet, Holdable, ReachableWrench)
 
 
-def falls_freely(problem: ConstrainedProblem) -> bool:
-    """Return whether a robot falls before the impact, because it has neither rotors, nor feet, nor a fixed base."""
-    robot = problem.robot
-    held = robot.spec.propulsion is not None or problem.objective.supports or problem.requirements.base == "fixed"
-    return bool(robot.floating and np.any(robot.model.gravity.linear) and not held)
-
-
 def landed(problem: ConstrainedProblem, q: Array) -> ConstrainedProblem:
     """Return the problem of a robot that stands on its contacts after a fall; the contact points stay as at ``q``."""
-    known, numeric = {s.frame: s for s in resolve_supports(problem.robot, None)}, Numeric(problem.robot.model).at(q)
-    feet = []
-    for contact in problem.objective.contacts:
-        foot = known.get(contact.frame, Support(contact.frame))
-        feet.append(foot if foot.has_sole else replace(foot, offset=contact.offset))
+    feet, numeric = landing_feet(problem.objective), Numeric(problem.robot.model).at(q)
     held = [held_support(problem.robot, numeric, foot) for foot in feet]
-    objective = replace(problem.impact, supports=tuple(feet))
+    objective = replace(problem.impact, supports=feet)
     return replace(problem, objective=objective, constraints=(*held, *problem.constraints), rows=())
 
 
@@ -101,7 +89,8 @@ class StrikeSpaces:
         ]
         dropped = (*_POSES, *_AT_REST) if first else (*_POSES, *_AT_REST, HeldTurn)
         struck = [c for k, c in enumerate(rest) if k < first or not isinstance(c, dropped)]
-        held = [c for c in rest if not (falls_freely(problem) and isinstance(c, _POSES))]
+        falls = falls_freely(problem.objective, wanted.base)
+        held = [c for c in rest if not (falls and isinstance(c, _POSES))]
         held += [] if turns else turned
         above, line, pressed = list[Constraint](), list[Constraint](), list[Constraint]()
         for oracle, n in zip(oracles, self.normals, strict=True):

@@ -162,7 +162,8 @@ def scenario_requirements(
         larger = max(tilt, spread.normal), max(shift, spread.gap)
         settings = replace(settings, strike=True, speed=speed, surface_spread=larger)
     demands = requirements(settings, objective)
-    return replace(demands, com_over_feet=bool(objective.supports), com_asked=False, limit_share=SHARE)
+    over_feet = demands.com_over_feet or bool(objective.supports)
+    return replace(demands, com_over_feet=over_feet, com_asked=False, limit_share=SHARE)
 
 
 def _tell(done: int, total: int) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from scipy.optimize import linprog
+from scipy.spatial import ConvexHull
 
 from impact_posture.controller_export.controller_structure import structure_of
 from impact_posture.controller_export.path_source import path_reference, render_path
@@ -22,9 +23,10 @@ from impact_posture.path.follow_through import RESTITUTIONS
 from impact_posture.path.path_files import read_path, write_path
 from impact_posture.path.posture_path import PosturePath, posture_path
 from impact_posture.path.strike import check_strike, impact_velocity
-from impact_posture.path.strike_spaces import StrikeSpaces, falls_freely
+from impact_posture.path.strike_spaces import StrikeSpaces
 from impact_posture.posture.constraints.requirements import Requirements
 from impact_posture.posture.formulation.build_problem import build_problem
+from impact_posture.posture.formulation.landing import falls_freely
 from impact_posture.posture.formulation.problem_file import prepare
 from impact_posture.posture.search.multistart import PostureSolution, solve
 from impact_posture.system.arrays import Array
@@ -201,10 +203,41 @@ def test_a_robot_whose_contacts_turn_with_its_links_does_not_fall() -> None:
 def test_a_robot_without_gravity_does_not_fall() -> None:
     task = {"robot": "solo12", "frame": "FL_FOOT", "normal": (0, 0, 1), "contact_pose": "position", "support": ()}
     problem = prepare(make_settings(task)).problem
-    floating = replace(problem, robot=replace(problem.robot, model=problem.robot.model.copy()))
+    weightless = replace(problem.robot, model=problem.robot.model.copy())
+    floating = replace(problem, robot=weightless, objective=replace(problem.impact, robot=weightless))
     floating.robot.model.gravity.linear = np.zeros(3)
     check_strike(floating, 1.0)
-    assert not falls_freely(floating) and falls_freely(problem)
+    assert not falls_freely(floating.objective, "level") and falls_freely(problem.objective, "level")
+
+
+def test_a_falling_robot_lands_with_its_center_of_mass_over_its_feet() -> None:
+    """Without this constraint, the center of mass of the optimum is behind the feet, so no stop exists."""
+    frames = ("FL_foot", "FR_foot", "RL_foot", "RR_foot")
+    task = {
+        "robot": "example-robot-data:a1_description/urdf/a1.urdf", "root": "free-flyer",
+        "contact": tuple(f"{frame}:0,0,1" for frame in frames), "contact_pose": "position", "normal": None,
+        "support": (), "base": "level", "contact_point": "front", "limit_margin": 0.2, "objective": "sticking",
+        "speed": SPEED, "strike": True, "collision": False,
+    }  # fmt: skip
+    depths, values, stops = [], [], []
+    for com in (None, False):
+        solution = solve(prepare(make_settings({**task, "com": com})).problem, starts=2, jobs=1)
+        model, q = solution.problem.robot.model, solution.q
+        data = model.createData()
+        center = np.array(pin.centerOfMass(model, data, q))[:2]
+        pin.framesForwardKinematics(model, data, q)
+        hull = ConvexHull([data.oMf[model.getFrameId(frame)].translation[:2] for frame in frames])
+        sides, middle = hull.equations, hull.points.mean(axis=0)
+        inside = [-(sides[:, :2] @ point + sides[:, 2]).max() for point in (center, middle)]
+        depths.append(inside[0] / inside[1])
+        values.append(solution.problem.objective.value(q))
+        strike = posture_path(solution, strike=SPEED).strike
+        assert strike and strike.follow_through
+        stops.append(strike.follow_through.stopped)
+    assert depths[0] > 0.3 - 1e-6 and depths[1] < 0 and values[0] > values[1]
+    assert stops == [4, 0]
+    with pytest.raises(InputError, match="no feet to keep the center of mass over"):
+        prepare(make_settings({**task, "strike": False, "com": True}))
 
 
 def test_a_robot_that_cannot_stand_on_its_contacts_does_not_stop() -> None:

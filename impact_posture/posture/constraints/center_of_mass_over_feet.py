@@ -31,7 +31,7 @@ class CenterOfMassOverFeet(ExpressionConstraint):
         self.lower, self.upper = np.full(len(offsets), -np.inf), np.full(len(offsets), -margin)
 
     def describe(self) -> str:
-        return f"{self.name}, {self.margin:g} m inside the support polygon"
+        return f"{self.name}, {self.margin:.3g} m inside the support polygon"
 
     def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
         k, loaded = self.rows, tree if self._model is None else Tree(self._model, tree.q)

@@ -32,6 +32,7 @@ from impact_posture.posture.constraints.pose_constraints import (
 from impact_posture.posture.constraints.requirements import Requirements
 from impact_posture.posture.constraints.surroundings import Surroundings
 from impact_posture.posture.formulation.impact_constraints import impact_constraints
+from impact_posture.posture.formulation.landing import landing_feet
 from impact_posture.posture.formulation.well_posed import fix_undetermined_motions, make_well_posed
 from impact_posture.posture.loads.load_cases import LoadCases, load_cases
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem
@@ -42,6 +43,10 @@ from impact_posture.system.arrays import Array
 
 # The bounds of a follower in the program are wider than its joint limits by this value, rad or m.
 _WIDER = 0.01
+# After a fall, the center of mass is at least this share of the distance from the middle of the feet to the nearest
+# edge of the support polygon inside the polygon.  Near an edge, the feet cannot brake the fall without tipping the
+# robot, and the contact point of a round foot moves with the leg.
+_LANDING = 0.3
 
 
 def build_problem(robot: Robot, objective: Objective, given: Array, requirements: Requirements) -> ConstrainedProblem:
@@ -70,7 +75,7 @@ def build_problem(robot: Robot, objective: Objective, given: Array, requirements
     decided: list[str] = []
     if requirements.com_over_feet:
         try:
-            constraints.append(_com_constraint(robot, objective.supports, numeric, requirements.com_margin))
+            constraints.append(_com_constraint(objective, numeric, requirements.com_margin))
         except InputError:
             if requirements.com_asked:
                 raise
@@ -238,16 +243,24 @@ def _base_constraints(robot: Robot, numeric: Numeric, requirements: Requirements
     return []
 
 
-def _com_constraint(
-    robot: Robot, supports: Sequence[Support], numeric: Numeric, margin: float
-) -> CenterOfMassOverFeet:
-    points = [point_on(robot, support.frame, corner) for support in supports for corner in support.corners]
+def _com_constraint(objective: Objective, numeric: Numeric, margin: float) -> CenterOfMassOverFeet:
+    """Return the constraint for the feet, or else for the contacts on which the robot lands.
+
+    A contact point moves if its frame turns about its held origin, so the polygon of a landing has the origins as
+    corners, or the corners of soles.
+    """
+    landing = (foot if foot.has_sole else Support(foot.frame) for foot in landing_feet(objective))
+    feet = objective.supports or tuple(landing)
+    points = [point_on(objective.robot, foot.frame, corner) for foot in feet for corner in foot.corners]
     corners = [numeric.placement(point).translation[:2] for point in points]
     edges = polygon_edges(corners)
     if edges is None:
         fault = "the feet span no area above which the center of mass could stay"
         hint = "give three feet or soles with a size, set com_over_feet = false, or choose no `com`"
         raise InputError(fault, where="com_over_feet", hint=hint)
+    if not objective.supports:
+        normals, offsets = edges
+        margin = max(margin, _LANDING * float((offsets - normals @ np.mean(corners, axis=0)).min()))
     return CenterOfMassOverFeet(*edges, margin)
 
 

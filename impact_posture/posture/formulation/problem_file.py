@@ -21,6 +21,7 @@ from impact_posture.posture.approach.attainable_speed import FASTEST
 from impact_posture.posture.constraints.center_of_mass_over_feet import CenterOfMassOverFeet
 from impact_posture.posture.constraints.requirements import Requirements
 from impact_posture.posture.formulation.build_problem import build_problem
+from impact_posture.posture.formulation.landing import falls_freely
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem
 from impact_posture.robot.model_variant import ModelVariant
 from impact_posture.robot.robot_loader import from_folder, names_a_path
@@ -104,12 +105,14 @@ def requirements(settings: ProblemSettings, objective: Objective) -> Requirement
     robot, spec = objective.robot, objective.robot.spec.constraints
     poses = [settings.contact_pose or robot.contact_pose(contact.frame) for contact in objective.contacts]
     base = "level" if spec.level_base and robot.floating else "free"
-    com = spec.com_over_feet and bool(objective.supports) if settings.com is None else settings.com
+    lands = settings.strike and falls_freely(objective, settings.base or base)
+    stands = spec.com_over_feet and bool(objective.supports)
+    com = stands or lands if settings.com is None else settings.com
     if settings.obstacles and not settings.collision:
         raise InputError(
             "have no effect without `collision`", where="obstacles", hint="add `collision`, or omit the obstacles"
         )
-    if com and not objective.supports:
+    if com and not objective.supports and not lands:
         fault = "there are no feet to keep the center of mass over"
         raise InputError(fault, where="com", hint="add `support`, or choose no `com`")
     if settings.keep_contacts and not objective.supports:

@@ -171,6 +171,9 @@ def _remedy(problem: ConstrainedProblem, seed: int, *, struck: bool, overlap: bo
     if objective.contacts and wanted.contact_pose not in ("position", "box", "free"):
         freed = replace(wanted, contact_pose="position", target_quaternion=None)
         changes.append(("let the contact frame turn (`contact_pose` position)", objective, freed))
+    if wanted.com_over_feet and not objective.supports:
+        leaning = replace(wanted, com_over_feet=False)
+        changes.append(("let the center of mass leave the feet that land (no `com`)", objective, leaning))
     if overlap:
         closer = replace(wanted, clearance=_LEAST_CLEARANCE)
         changes.append((f"let links come closer (`clearance` below {wanted.clearance:g})", objective, closer))
