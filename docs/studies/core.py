@@ -85,6 +85,7 @@ STUDIES = {
         Study(
             "screening", "random_postures", "random postures of talos; postures", 100_000_000, target="study-global"
         ),
+        Study("draws", "random_postures:command", "exports to draw for screening; postures", 100_000_000, page=False),
         Study("flow", "flow", "where the reference flow rests, from random starts", 1000, target="study-flow"),
         Study("strikes", "strikes", "planned strikes; seeds", 10, target="study-strikes", parts=True),
         Study("landing", "strikes:landing", "a fall onto four feet; seeds", 10, target="study-strikes", parts=True),
