@@ -86,13 +86,15 @@ def scaled(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedC
     rates = [moment(curve, law, x) for x in tau.tolist()]
     speed, known = space.problem.robot.velocity_limits, not limits.missing
     least = np.zeros(len(tau))
+    slower = slowed(space, curve, limits) if known and curve.corners.any() else None
     if known:
-        zero = np.zeros(space.model.nv)
+        zero, largest = np.zeros(space.model.nv), list[float | None]()
         rests = [(q, limits.load(q, zero, zero)) for q, _, _ in rates]
-        largest = [
-            limits.largest_rate(q, rest, limits.load(q, v, a) - rest)
-            for (q, v, a), (_, rest) in zip(rates, rests, strict=True)
-        ]
+        for (q, v, a), (_, rest) in zip(rates, rests, strict=True):
+            largest.append(limits.largest_rate(q, rest, limits.load(q, v, a) - rest))
+            # The remaining instants can only make the scaled motion longer.
+            if slower is not None and largest[-1] and largest[-1] ** -0.5 > slower.rows.t[-1]:
+                return slower
         known = all(largest)
         least = np.array([rate**-0.5 if rate else 0.0 for rate in largest])
     if not known:
@@ -104,10 +106,8 @@ def scaled(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedC
             notes.append(f"where no velocity limit is known, {_DEFAULT_SPEED:g} rad/s or m/s is assumed")
     least = np.maximum(least, [float((np.abs(v) / speed).max()) for _, v, _ in rates])
     duration = max(float(least.max()), SAMPLE_TIME)
-    if known and curve.corners.any():
-        slower = slowed(space, curve, limits)
-        if slower is not None and slower.rows.t[-1] < duration:
-            return slower
+    if known and slower is not None and slower.rows.t[-1] < duration:
+        return slower
     return sampled(space, curve, limits, polynomial(_SMOOTH, duration), "scaled", tuple(notes))
 
 

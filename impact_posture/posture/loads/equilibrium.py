@@ -112,6 +112,7 @@ class Equilibrium:
         # Cache of the last results, because a search evaluates a posture several times.
         self._even: tuple[bytes, float] | None = None
         self._latest: tuple[bytes, Distribution] | None = None
+        self._forces: tuple[bytes, Array] | None = None
 
     def _affine(self, load: Array, by_force: Array) -> tuple[Array, Array, Array, Array]:
         """Return ``A, b, S, c`` for the balance ``A z + b`` and the shares ``S z + c``; ``load`` is for ``z = 0``."""
@@ -216,13 +217,17 @@ class Equilibrium:
             np.concatenate([-b, 1 - c]),
             np.append(self.load.lower, 0.0),
             np.append(self.load.upper, _MOST),
+            primal=True,
         )
         if optimum is None:
             return None
         return float("inf") if optimum.x[-1] > _MOST * (1 - 1e-9) else float(optimum.x[-1])
 
     def _by_force(self, q: Array) -> Array:
-        return self.load.torque(q, np.zeros(self.load.count), by_posture=False).by_force
+        key = q.tobytes()
+        if self._forces is None or self._forces[0] != key:
+            self._forces = key, self.load.torque(q, np.zeros(self.load.count), by_posture=False).by_force
+        return self._forces[1]
 
     def _least_share(self, A: Array, b: Array, S: Array, c: Array) -> tuple[Array, float, Array] | None:
         """Solve ``min s`` with ``A z + b = 0``, ``|S z + c| ≤ s``; return z, the imbalance 0 and the multipliers."""
