@@ -107,13 +107,17 @@ class StaticLoad:
         forces = [pin.Force.Zero() for _ in range(model.njoints)]
         by_force = np.zeros((model.nv, self.count))
         turning = np.zeros((model.nv, model.nv))
+        joints = {source.point.joint for source in self.sources}
+        turned = {joint: np.array(data.oMi[joint].rotation).T for joint in joints}
+        jacobians = {
+            joint: np.array(pin.getJointJacobian(model, data, joint, pin.LOCAL)).reshape(6, -1) for joint in joints
+        }
         for source, part, start in zip(self.sources, self.split(z), self._parts, strict=False):
             point, joint = source.point, source.point.joint
-            axes = point.rotation if source.in_frame else np.array(data.oMi[joint].rotation).T
+            axes, jacobian = point.rotation if source.in_frame else turned[joint], jacobians[joint]
             arm = pin.skew(point.position)
             local = np.zeros((6, 6))
             local[:3, :3], local[3:, :3], local[3:, 3:] = axes, arm @ axes, axes
-            jacobian = np.array(pin.getJointJacobian(model, data, joint, pin.LOCAL)).reshape(6, -1)
             by_force[:, start : start + part.size] = -jacobian.T @ local @ source.columns
             wrench = source.columns @ part + source.constant
             forces[joint] = forces[joint] + pin.Force(local @ wrench)
