@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -100,7 +100,8 @@ class BatchMetric:
         of the manifest names.
 
         Raises:
-            InputError: A shape is wrong, CuPy is not installed, or the export has no CUDA code.
+            InputError: A shape is wrong, an array is neither on the CPU nor on an NVIDIA GPU, CuPy is not installed,
+                or the export has no CUDA code.
         """
         return self._call("eval", q, n, in_q)
 
@@ -114,15 +115,18 @@ class BatchMetric:
         return self._call("objective", q, None, in_q)
 
     def _call(self, name: str, q: Any, n: Any, in_q: bool) -> tuple[Any, Any]:
-        package, on_gpu = _package(q), _on_gpu(q)
+        with _readable("q"):
+            package, on_gpu = _package(q), _on_gpu(q)
         # Without quaternions and cosine-sine pairs, both gradients are equal.
         in_q = in_q and bool(self._joints)
         xp = import_extra("cupy", "cuda", "CuPy") if on_gpu else np
         device = q.__dlpack_device__()[1] if on_gpu else 0
         with xp.cuda.Device(device) if on_gpu else nullcontext():
-            given = _to(xp, q)
+            with _readable("q"):
+                given = _to(xp, q)
             rows = xp.ascontiguousarray(given, dtype=self.gradient.dtype)
-            normals = () if n is None else (xp.asarray(_to(xp, n), dtype=self.gradient.dtype),)
+            with _readable("n"):
+                normals = () if n is None else (xp.asarray(_to(xp, n), dtype=self.gradient.dtype),)
             self.gradient.check_shapes(rows, *normals)
             rows, scales = self.normalized(xp, rows) if in_q else (rows, None)
             inputs = (rows, *normals)
@@ -230,6 +234,16 @@ def _package(array: Any) -> Any:
     if hasattr(array, "__array_namespace__"):
         return array.__array_namespace__()
     return sys.modules[type(array).__module__.partition(".")[0]] if hasattr(array, "__dlpack__") else np
+
+
+@contextmanager
+def _readable(name: str) -> Iterator[None]:
+    """Name the array in the errors of its package, for example if the array is on a TPU or requires a gradient."""
+    try:
+        yield
+    except (BufferError, RuntimeError, ValueError) as error:
+        hint = "give an array of float32 or float64 on the CPU or on an NVIDIA GPU"
+        raise InputError(f"cannot be read ({error})", where=name, hint=hint) from None
 
 
 def _on_gpu(array: Any) -> bool:

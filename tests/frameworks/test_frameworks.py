@@ -132,6 +132,32 @@ def test_arrays_on_a_gpu_call_the_kernels(sample: Sample, monkeypatch: pytest.Mo
     (sample.out / "hidden").rename(sample.out / "small.cuh")
 
 
+class Unreadable:
+    """An array on another device, which refuses either its device number or its content."""
+
+    def __init__(self, refused: str) -> None:
+        self.refused = refused
+
+    def __dlpack_device__(self) -> tuple[int, int]:
+        if self.refused == "device":
+            raise BufferError("is on a TPU")
+        return 10, 0
+
+    def __dlpack__(self, **options: Any) -> Any:
+        raise BufferError("is on an AMD GPU")
+
+
+@pytest.mark.parametrize(("refused", "reason"), [("device", "is on a TPU"), ("content", "is on an AMD GPU")])
+def test_arrays_on_other_devices_are_named(sample: Sample, refused: str, reason: str) -> None:
+    metric, array = ip.gpu.load(sample.out), Unreadable(refused)
+    for name, call in {
+        "q": lambda: metric.objective(array),
+        "n": lambda: metric.value_and_gradient(sample.q, array),
+    }.items():
+        with pytest.raises(InputError, match=rf"^{name}: cannot be read \({reason}\); give an array of float32"):
+            call()
+
+
 def test_exports_of_earlier_versions_do_not_name_the_entries_of_q(sample: Sample) -> None:
     gradient = ip.gpu.load(sample.out).gradient
     gradient.manifest = {key: value for key, value in gradient.manifest.items() if key != "q_names"}
