@@ -23,6 +23,15 @@ def cupy() -> Any:
 
 
 @pytest.fixture
+def torch() -> Any:
+    """Return PyTorch, if PyTorch uses the GPU."""
+    torch = pytest.importorskip("torch", reason="needs PyTorch: pip install torch", exc_type=ImportError)
+    if not torch.cuda.is_available():
+        pytest.skip("PyTorch does not use the GPU: install PyTorch with CUDA")
+    return torch
+
+
+@pytest.fixture
 def jax(monkeypatch: pytest.MonkeyPatch) -> Any:
     """Return JAX, if JAX uses the GPU.  Do not let JAX reserve the memory that other packages need."""
     monkeypatch.setenv("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
@@ -34,7 +43,7 @@ def jax(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 @pytest.mark.parametrize("name", ["cupy", "torch", "jax"])
 def test_batches(sample: Sample, name: str, request: pytest.FixtureRequest) -> None:
-    package = request.getfixturevalue("jax") if name == "jax" else pytest.importorskip(name)
+    package = request.getfixturevalue(name)
     puts: dict[str, Callable[[Any], Any]] = {
         "cupy": lambda array: package.asarray(array), "jax": lambda array: package.numpy.asarray(array),
         "torch": lambda array: package.tensor(array, device="cuda"),
@@ -62,8 +71,7 @@ def on_cpu(array: Any) -> Any:
     return array.get() if hasattr(array, "get") else np.asarray(array.cpu() if hasattr(array, "cpu") else array)
 
 
-def test_torch_differentiates(sample: Sample) -> None:
-    torch = pytest.importorskip("torch")
+def test_torch_differentiates(sample: Sample, torch: Any) -> None:
     metric = ip.torch.load(sample.out)
     q = torch.tensor(sample.q, device="cuda", requires_grad=True)
     metric(q, N).sum().backward()
