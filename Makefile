@@ -17,7 +17,7 @@ help:
 	@echo "make test-wheel  the steps of `make wheel`, then all tests with the installed wheel"
 	@echo "make lowest      the steps of `make test-wheel` with the lowest versions that pyproject.toml allows; PYTHON= selects the Python"
 	@echo "make bench       measure solve times, ticks, and the exported kernel against other implementations"
-	@echo "make bench-gpu   measure the CUDA export on this GPU, beside all cores, PyTorch and frax (three minutes)"
+	@echo "make bench-gpu   measure the CUDA export on this GPU beside all cores and frax, and calls from CuPy, PyTorch and JAX (four minutes)"
 	@echo "make coverage    measure the branch coverage of both packages by the tests, for the documentation"
 	@echo "make study-impacts  compare predictions of the objectives with impacts simulated in MuJoCo"
 	@echo "make study-elastic  compare the predicted inertia of arms with elastic joints with MuJoCo"

@@ -67,7 +67,7 @@ STUDIES = {
         Study("answer", "answer", "time of optimize until answer and end, or of another version", 5, page=False),
         Study("formulations", "formulations", "impact equations as constraints or in the objective", 12, page=False),
         Study("kernel", "kernel.times", "H and ∇H: our code, Pinocchio C++, ADAM and CasADi; passes", 101),
-        Study("gpu", "gpu.study", "H and ∇H on a GPU, on all cores, in PyTorch and in frax"),
+        Study("gpu", "gpu.study", "H and ∇H on a GPU and on all cores; calls from CuPy, PyTorch and JAX; frax"),
         Study("loader", "exported:loader", "a call of exported code from Python; passes", 100, page=False),
         Study("tsid", "tsid", "a tick of the online controllers; ticks", 2000),
         Study("relaxed", "relaxed", "relaxed ticks in C of pushed robots; budget of iterations", 100, page=False),

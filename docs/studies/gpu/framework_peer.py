@@ -1,4 +1,7 @@
-"""Time calls of a kernel from PyTorch through NVRTC: ``framework_peer.py CASE``, with CASE from ``cases.json``."""
+"""Time H with its derivatives by the entries of q: ``framework_peer.py CALL CASE``, with CASE from ``cases.json``.
+
+CALL is ``ip.gpu`` (with arrays of CuPy), ``ip.torch``, ``ip.jax``, or ``ip.jax on CPU``.
+"""
 
 from __future__ import annotations
 
@@ -6,77 +9,84 @@ import json
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
-import cupy
 import numpy as np
-import torch
 
-case = json.loads(sys.argv[1])
-dtype = torch.float64 if case["real"] == "double" else torch.float32
-began = time.perf_counter()
-name = f"{case['prefix']}_eval_kernel<{case['threads']}>"
-module = cupy.RawModule(
-    code=Path(case["header"]).read_text(encoding="utf-8"), options=("-std=c++17",), backend="nvrtc",
-    name_expressions=(name,),
-)  # fmt: skip
-kernel = module.get_function(name)
-result = {"nvrtc_s": time.perf_counter() - began, "rows": [], "us": []}
-n = torch.tensor([0.0, 0.0, 1.0], device="cuda", dtype=dtype)
+from impact_posture.frameworks import gpu
 
+name, case = sys.argv[1], json.loads(sys.argv[2])
+batch = gpu.load(Path(case["header"]).parent)
+nq, dtype, N = case["nq"], batch.gradient.dtype, np.array([0.0, 0.6, 0.8])
+samples = np.fromfile(case["samples"], dtype=np.float64, offset=12).reshape(-1, nq + 4 + case["nv"])[:, :nq]
 
-def evaluate(q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return H and ∇H of each row of q, as a framework would call the kernel."""
-    rows, threads = q.shape[0], case["threads"]
-    H, grad = (torch.empty(shape, device="cuda", dtype=dtype) for shape in (rows, (rows, case["nv"])))
-    pointers = [H.data_ptr(), grad.data_ptr(), 0]
-    with cupy.cuda.ExternalStream(torch.cuda.current_stream().cuda_stream):
-        arguments = (q.data_ptr(), n.data_ptr(), np.int32(1), np.int32(rows), *pointers)
-        kernel((-(-rows // threads),), (threads,), arguments)
-    return H, grad
+if name == "ip.gpu":
+    import cupy
 
+    put, get, n = cupy.asarray, cupy.asnumpy, cupy.asarray(N, dtype=dtype)
 
-class Metric(torch.autograd.Function):
-    """H of each row of q; the gradient is in the tangent space, which is the space of q for a fixed base."""
+    def call(q: Any) -> Any:
+        return batch.value_and_gradient(q, n, in_q=True)
 
-    @staticmethod
-    def forward(context, q):  # type: ignore[no-untyped-def]
-        """Compute H, and keep its gradient."""
-        H, grad = evaluate(q)
-        context.save_for_backward(grad)
-        return H
+    def wait(_: Any) -> None:
+        cupy.cuda.Device().synchronize()
 
-    @staticmethod
-    def backward(context, weight):  # type: ignore[no-untyped-def]
-        """Multiply the gradient by the derivative of the loss with respect to H."""
-        return weight[:, None] * context.saved_tensors[0]
+elif name == "ip.torch":
+    import torch
 
+    from impact_posture.frameworks.torch_metric import TorchMetric
 
-samples = np.fromfile(case["samples"], dtype=np.float64, offset=12).reshape(-1, case["nq"] + 4 + case["nv"])
-for rows in (1, 4096, 65536):
-    q = torch.tensor(np.resize(samples[:, : case["nq"]], (rows, case["nq"])), device="cuda", dtype=dtype)
-    evaluate(q)
-    torch.cuda.synchronize()
-    times = []
-    for _ in range(5):
-        began = time.perf_counter()
-        for _ in range(30):
-            evaluate(q)
-        torch.cuda.synchronize()
-        times.append((time.perf_counter() - began) / 30 * 1e6)
-    result["rows"].append(rows)
-    result["us"].append(sorted(times)[2])
-if case["nq"] == case["nv"]:
-    q = q.clone().requires_grad_(True)
-    optimizer = torch.optim.Adam([q], 0.02)
-    torch.cuda.synchronize()
-    began = time.perf_counter()
-    for step in range(300):
-        optimizer.zero_grad()
-        H = Metric.apply(q)
-        if step == 0:
-            result["before"] = H.median().item()
+    torch_metric, n = TorchMetric(batch), torch.tensor(N.astype(dtype), device="cuda")
+
+    def put(rows: Any) -> Any:
+        return torch.tensor(rows, device="cuda", requires_grad=True)
+
+    def get(array: Any) -> Any:
+        return array.detach().cpu().numpy()
+
+    def call(q: Any) -> Any:
+        q.grad = None
+        H = torch_metric(q, n)
         H.sum().backward()
-        optimizer.step()
-    torch.cuda.synchronize()
-    result |= {"adam_s": time.perf_counter() - began, "after": H.median().item()}
-print(json.dumps(result))
+        return H, q.grad
+
+    def wait(_: Any) -> None:
+        torch.cuda.synchronize()
+
+else:
+    import jax
+
+    from impact_posture.frameworks.jax_metric import JaxMetric
+
+    jax.config.update("jax_enable_x64", dtype == np.float64)
+    device = jax.devices("cpu" if name.endswith("CPU") else "cuda")[0]
+    each = jax.jit(jax.vmap(jax.value_and_grad(JaxMetric(batch)), (0, None)))
+
+    def put(rows: Any) -> Any:
+        return jax.device_put(rows, device)
+
+    get, wait, n = np.asarray, jax.block_until_ready, put(N.astype(dtype))
+
+    def call(q: Any) -> Any:
+        return each(q, n)
+
+
+def timed(q: Any, loops: int) -> float:
+    """Return the mean time of calls in a row, in s."""
+    began = time.perf_counter()
+    for _ in range(loops):
+        results = call(q)
+    wait(results)
+    return (time.perf_counter() - began) / loops
+
+
+first, us = timed(put(samples[:1].astype(dtype)), 1), []
+for rows in (1, 4096, 65536, 1 << 20):
+    q = put(np.resize(samples, (rows, nq)).astype(dtype))
+    timed(q, 3)
+    loops = int(np.clip(0.05 / timed(q, 1), 1, 30))
+    us.append(1e6 * sorted(timed(q, loops) for _ in range(5))[2])
+expected = batch.value_and_gradient(samples.astype(dtype), N, in_q=True)
+results = [get(array) for array in call(put(samples.astype(dtype)))]
+errors = [np.abs(a - b).max() / np.abs(b).max() for a, b in zip(results, expected, strict=True)]
+print(json.dumps({"first_s": first, "us": us, "error_H": float(errors[0]), "error_grad": float(errors[1])}))

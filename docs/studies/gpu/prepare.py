@@ -31,8 +31,8 @@ ROBOTS = {
     "tilthex_arm": ("tilthex_arm", False), "panda": ("panda", False), "solo8": ("solo8", True),
     "talos": ("talos", True), "talos_free": ("talos", False),
 }  # fmt: skip
-# Cases that frax computes too.
-_FRAX = ("panda", "talos")
+# Cases that frax computes too, and cases that CuPy, PyTorch and JAX call.
+_FRAX, _CALLED = ("panda", "talos"), ("panda", "talos_free")
 _SAMPLES = 2048
 _ROWS = 1 << 20
 _PROGRAMS = ("run.py", "bench.cu", "cores.c", "frax_peer.py", "framework_peer.py")
@@ -72,8 +72,10 @@ def prepare(folder: Path) -> list[dict[str, Any]]:
     folder.mkdir(parents=True, exist_ok=True)
     for name in _PROGRAMS:
         shutil.copy(Path(__file__).with_name(name), folder / name)
-    if (spec := find_spec("frax")) is not None and spec.origin is not None:
-        shutil.copytree(Path(spec.origin).parent, folder / "frax", dirs_exist_ok=True)
+    for package in ("impact_posture", "frax"):
+        if (spec := find_spec(package)) is not None and spec.origin is not None:
+            ignore = shutil.ignore_patterns("__pycache__")
+            shutil.copytree(Path(spec.origin).parent, folder / package, ignore=ignore, dirs_exist_ok=True)
     cases = []
     for name, (source, feet) in ROBOTS.items():
         robot = load_robot(source)
@@ -86,13 +88,15 @@ def prepare(folder: Path) -> list[dict[str, Any]]:
             out = folder / f"{name}-{real.name}"
             out.mkdir(exist_ok=True)
             export(objective_of(robot, feet), out, prefix=name, real=real, cuda=True, check=False, force=True)
+            # Build the library, which the calls from Python load.
+            gradient = ImpactGradient.load(out)
             if real is DOUBLE:
-                write_samples(ImpactGradient.load(out), robot, folder / samples)
-                (out / f"lib{name}.so").unlink()
+                write_samples(gradient, robot, folder / samples)
             cases.append({
                 "name": name, "real": real.name, "prefix": name, "header": f"{out.name}/{name}.cuh",
                 "samples": samples, "rows": _ROWS // (4 if robot.nv > 20 else 1), "threads": 128, "nq": robot.nq,
                 "nv": robot.nv, "urdf": urdf, "root": robot.spec.model.root, "frax": name in _FRAX and real is DOUBLE,
+                "frameworks": name in _CALLED,
             })  # fmt: skip
     (folder / "cases.json").write_text(json.dumps(cases, indent=1), encoding="utf-8")
     return cases

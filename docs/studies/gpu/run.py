@@ -1,8 +1,8 @@
 """Build and time the cases that ``prepare.py`` wrote: ``run.py [--build ARCHITECTURE] [--only TEXT]``.
 
-This program needs nvcc, gcc and Python without packages.  Run the program in a folder that ``prepare.py`` wrote, also
-on a machine without impact-posture.  ``--build sm_90`` only builds the programs of the GPU, on a machine without a
-GPU.
+This program needs nvcc, gcc and Python.  Run the program in a folder that ``prepare.py`` wrote, also on a machine
+without impact-posture.  The table of calls needs NumPy, pydantic, CuPy, PyTorch and JAX; a row without its packages
+contains the error.  ``--build sm_90`` only builds the programs of the GPU, on a machine without a GPU.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -19,12 +20,17 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).resolve().parent
+CUPY_CACHE = HERE / "kernels"
 Case = dict[str, Any]
 
 
 def run(line: list[str], seconds: int = 120) -> str:
     """Run a program in this folder; return its last line, or a JSON object with the error."""
-    environment = os.environ | {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
+    environment = os.environ | {
+        "XLA_PYTHON_CLIENT_PREALLOCATE": "false", "CUPY_CACHE_DIR": str(CUPY_CACHE),
+        # The program docs.studies sets this variable to 1.
+        "OMP_NUM_THREADS": str(os.cpu_count()),
+    }  # fmt: skip
     try:
         done = subprocess.run(
             line, cwd=HERE, env=environment, capture_output=True, text=True, timeout=seconds, check=False
@@ -102,15 +108,16 @@ def cores(cases: list[Case]) -> Iterator[list[str]]:
 
 
 def frameworks(cases: list[Case]) -> Iterator[list[str]]:
-    """Yield the times of calls from PyTorch."""
-
-    def cells(data: Case) -> list[str]:
-        adam = f"{data['adam_s']:.2f} s, {data['before']:.3g} to {data['after']:.3g}" if "adam_s" in data else "–"
-        return [f"{data['nvrtc_s']:.1f}", *[f"{us:.0f}" for us in data["us"]], adam]
-
+    """Yield the times of calls from CuPy, PyTorch and JAX."""
+    # Measure the first call with an empty cache of kernels.  Other calls of a case use the same kernel.
+    shutil.rmtree(CUPY_CACHE, ignore_errors=True)
     for case in cases:
-        answer = run([sys.executable, "framework_peer.py", json.dumps(case)])
-        yield row([case["name"], case["real"]], answer, cells)
+        for name in ("ip.gpu", "ip.torch", "ip.jax", "ip.jax on CPU"):
+            answer = run([sys.executable, "framework_peer.py", name, json.dumps(case)])
+            yield row([case["name"], case["real"], name], answer, lambda data: [
+                f"{data['first_s']:.1f}", *[f"{us:,.0f}" for us in data["us"]], f"{data['error_H']:.0e}",
+                f"{data['error_grad']:.0e}",
+            ])  # fmt: skip
 
 
 def frax(cases: list[Case]) -> Iterator[list[str]]:
@@ -145,7 +152,8 @@ def main() -> int:
     table(head, times(cases))
     double = [c for c in cases if c["real"] == "double"]
     table("robot|cores|million/s|error H", cores(double))
-    table("robot|type|NVRTC s|1 row µs|4,096 rows|65,536 rows|300 Adam steps of 65,536", frameworks(cases))
+    head = "robot|type|call|first call s|1 row µs|4,096 rows|65,536 rows|1,048,576 rows|error H|error ∇H"
+    table(head, frameworks([c for c in cases if c["frameworks"]]))
     table("frax|type|million/s|compile s|device", frax([c for c in double if c["frax"]]))
     print(f"\n{time.monotonic() - began:.0f} s")
     return 0
