@@ -195,19 +195,22 @@ def _path(page: Page, path: dict[str, Any]) -> None:
         stops = f"then stops within {number(after['longest_s'])} s after {after['stopped']}"
         # The feet of a robot that falls are pressed onto the ground, so only plastic impacts are considered.
         rebounds = "" if falls else f" to {RESTITUTIONS[-1]:g}"
+        alone = 1 + len(FACTORS) * (1 if falls else len(RESTITUTIONS))
+        normals = ", also along normals on the edge of the cone" if after["impacts"] > alone else ""
         page.line(
             f"  {stops if after['stopped'] else 'no stop along the velocity exists after any'} of {after['impacts']} "
             f"considered impacts (restitution {RESTITUTIONS[0]:g}{rebounds}, "
-            f"{FACTORS[0]:.0%} to {FACTORS[-1]:.0%} of the speed)"
+            f"{FACTORS[0]:.0%} to {FACTORS[-1]:.0%} of the speed{normals})"
         )
         for what, unit, room in (
             ("from a joint limit", "rad (m)", after["joints"]),
             ("between bodies, beyond the clearance,", "m", after["clearance"]),
-            ("of the center of pressure", "m", after["center_of_pressure"]),
+            ("of the center of pressure from an edge of the support polygon", "m", after["center_of_pressure"]),
         ):
             if room:
-                where = f"{room['of']}, after {room['impact']}"
-                page.line(f"  the least distance {what} is {number(room['distance'])} {unit}: {where}")
+                where = "" if room is after["center_of_pressure"] else f" {room['of']},"
+                at = f"{number(room['distance'])} {unit}:{where} after {room['impact']}"
+                page.line(f"  the least distance {what} is {at}")
         if after["hindrance"]:
             page.line(f"  {after['hindrance']}")
     # If the path does not reach the optimum, the verdict states the reason.

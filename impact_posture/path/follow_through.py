@@ -122,7 +122,8 @@ def follow_through(
     for k in range(_EDGE if cone > 0 else 0):
         angle = 2 * np.pi * k / _EDGE
         tilted = axes @ [np.cos(cone), np.sin(cone) * np.cos(angle), np.sin(cone) * np.sin(angle)]
-        around[f", normal {k + 1} on the edge of the cone"] = StrikeSpaces(standing, q, normals=tilted[None])
+        x, y, z = np.round(tilted, 3) + 0.0
+        around[f", normal {x:g} {y:g} {z:g}"] = StrikeSpaces(standing, q, normals=tilted[None])
     spread = product(restitutions, FACTORS, around.items())
     impacts = {"the predicted impact": (spaces, 1.0, 0.0 if falls else restitution)} | {
         f"restitution {e:g}, {factor:.0%} of the speed{where}": (at, factor, e) for e, factor, (where, at) in spread
@@ -173,13 +174,16 @@ def _stop(
 
     Along the curve of the stop, the normal velocities of the contact points are proportional to its speed, so contact
     points move away from their surfaces.  If the robot falls, the velocity of its center of mass is constant instead,
-    so the ground need not pull the feet.
+    so the ground need not pull the feet.  If feet slide after the impact, impulses at the feet first stop them.
     """
     if falls and limits.missing:
         return f"no stop exists, because {limits.missing}"
     space = spaces.rebound
-    held = equality_jacobian(space.problem, Numeric(space.model).at(q))
-    velocity = velocity - np.linalg.pinv(held, rcond=1e-9) @ (held @ velocity)
+    numeric = Numeric(space.model).at(q)
+    held, factor = equality_jacobian(space.problem, numeric), np.linalg.cholesky(numeric.mass_matrix())
+    # With M = LLᵀ, the nearest velocity in the metric M that holds the constraints: ν − L⁻ᵀ(H L⁻ᵀ)⁺Hν.
+    impulses = np.linalg.pinv(np.linalg.solve(factor, held.T).T, rcond=1e-9) @ (held @ velocity)
+    velocity = velocity - np.linalg.solve(factor.T, impulses)
 
     def rows(model: Numeric) -> Array:
         return np.vstack([equality_jacobian(space.problem, model), model.center_of_mass()[1]])

@@ -19,11 +19,12 @@ from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import InputError
 from impact_posture.impact.impact_contact import ImpactContact, point_on
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
-from impact_posture.path.follow_through import RESTITUTIONS
+from impact_posture.path.actuator_limits import ActuatorLimits
+from impact_posture.path.follow_through import RESTITUTIONS, _stop
 from impact_posture.path.path_files import read_path, write_path
 from impact_posture.path.posture_path import PosturePath, posture_path
 from impact_posture.path.strike import check_strike, impact_velocity
-from impact_posture.path.strike_spaces import StrikeSpaces
+from impact_posture.path.strike_spaces import StrikeSpaces, landed
 from impact_posture.posture.constraints.requirements import Requirements
 from impact_posture.posture.formulation.build_problem import build_problem
 from impact_posture.posture.formulation.landing import falls_freely
@@ -151,6 +152,23 @@ def test_the_velocity_after_the_landing_fulfills_the_laws_of_impact_at_all_feet(
     side, slip = np.linalg.norm(p[:, :2], axis=1), np.linalg.norm(u[:, :2], axis=1)
     assert (side <= friction * p[:, 2] + 1e-7).all()
     assert ((slip < 1e-6) | (side > friction * p[:, 2] - 1e-6)).all()
+
+
+def test_feet_that_slide_are_stopped_by_impulses_at_the_feet() -> None:
+    solution, path = landed_path()
+    after, q = path.strike and path.strike.follow_through, path.q[-1]
+    assert after
+    standing, (_, J) = landed(solution.problem, q), feet(solution, q)
+    sliding = after.velocity + np.random.default_rng(2).normal(size=after.velocity.size) * 0.05
+    limits = ActuatorLimits(standing.objective, q, standing.requirements)
+    stop = _stop("", StrikeSpaces(standing, q), q, sliding, limits, True)
+    assert not isinstance(stop, str) and np.abs(J @ sliding).max() > 0.01
+    velocity = next(stop.moments)[1]
+    np.testing.assert_allclose(J @ velocity, 0.0, atol=1e-6)
+    M = pin.crba(solution.problem.robot.model, solution.problem.robot.model.createData(), q)
+    change = (np.triu(M) + np.triu(M, 1).T) @ (velocity - sliding)
+    impulses = np.linalg.lstsq(J.T, change, rcond=None)[0]
+    np.testing.assert_allclose(J.T @ impulses, change, atol=1e-6)
 
 
 def test_the_stop_after_the_landing_is_within_the_limits_of_legs_and_ground() -> None:
