@@ -19,6 +19,8 @@ from impact_posture.robot.model_joints import finite_armature
 
 # Joint index → quantity of the link that the joint moves, such as its inertia, force or velocity.
 ByJoint = dict[int, ca.SX]
+# (joint index, values that a sweep computes at the joint, as a vector), in the order of the sweeps.
+Visits = list[tuple[int, ca.SX]]
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,8 @@ class Kinematics:
     of locked joints.  ``extra_inertia`` maps joint indices to constant 6×6 inertias in link coordinates.  These
     inertias are added to the inertias of the model; for example, a foot with compliance ε gets the point mass 1/ε.
     With ``limbs``, parameters replace the constants that differ between repeated limbs.  ``chart_x`` contains the
-    chart coordinates of ``q``.  Only :attr:`quaternions` needs ``chart_x``.
+    chart coordinates of ``q``.  Only :attr:`quaternions` needs ``chart_x``.  The sweeps append their values to
+    ``visits``.
     """
 
     def __init__(
@@ -58,8 +61,9 @@ class Kinematics:
         chart_x: ca.SX | None = None,
         extra_inertia: Mapping[int, NDArray[np.float64]] | None = None,
         limbs: RepeatedLimbs | None = None,
+        visits: Visits | None = None,
     ) -> None:
-        self.model, self.q = model, q
+        self.model, self.q, self.visits = model, q, visits
         self.chart = Chart(model)
         self.nv = self.chart.nv
         self._x = chart_x
@@ -85,6 +89,11 @@ class Kinematics:
         armature, locked = finite_armature(model)
         self.armature = self.by_joint("armature", armature)
         self.locked = tuple(int(k) for k in np.flatnonzero(locked))
+
+    def visit(self, joint: int, *values: ca.SX) -> None:
+        """Append values that a sweep computes at a joint to ``visits``, if it was given."""
+        if self.visits is not None:
+            self.visits.append((joint, ca.veccat(*map(ca.densify, values))))
 
     def _constant(self, joint: int, tag: str, of: Callable[[int], ArrayLike]) -> ca.SX:
         """Return a constant of a joint, with parameters for the numbers that differ between repeated limbs."""
@@ -169,6 +178,7 @@ class Kinematics:
         """Rotate a world direction into link coordinates."""
         for i in list(self.model.supports[joint])[1:]:
             direction = transposed_times(self._R[i], direction)
+            self.visit(i, direction)
         return direction
 
 

@@ -81,6 +81,13 @@ def motion_to_child(R: ca.SX, p: ca.SX, motion: ca.SX) -> ca.SX:
 
 
 @template
+def motion_to_parent(R: ca.SX, p: ca.SX, motion: ca.SX) -> ca.SX:
+    """Express a child-frame motion in the parent frame: ``w = R w, v = R v − w × p`` with the new ``w``."""
+    angular = R @ motion[3:]
+    return ca.vertcat(R @ motion[:3] - cross(angular, p), angular)
+
+
+@template
 def force_to_parent(R: ca.SX, p: ca.SX, force: ca.SX) -> ca.SX:
     """Express a child-frame force in the parent frame: ``f = R f, m = R m + p × R f``."""
     linear = R @ force[:3]

@@ -56,13 +56,14 @@ def test_tangent_map_is_the_derivative_of_pinocchios_integrate(name: str) -> Non
         assert_close(tangent_fun(q), np.column_stack(columns), 1e-10, "tangent map")
 
 
+@pytest.mark.parametrize("lean", [False, True])
 @pytest.mark.parametrize("name", ["mixed", "solo8", "kinova", "talos", "panda"])
-def test_adjoint_gradients_are_casadis_derivatives_on_the_tangent_space(name: str) -> None:
+def test_adjoint_gradients_are_casadis_derivatives_on_the_tangent_space(name: str, lean: bool) -> None:
     """``∂/∂q`` by reverse AD, times the tangent map, equals the backward sweep."""
     model = _model(name)
     generator = rng(name, "adjoint")
     q = ca.SX.sym("q", model.nq)
-    tree = Tree(model, q)
+    tree = Tree(model, q, visits=[] if lean else None)
     point = PointOnLink(model.njoints - 1, generator.normal(size=3), np.array(pin.SE3.Random().rotation))
     v, tau, other_tau = (ca.SX(generator.normal(size=model.nv)) for _ in range(3))
     force, moment = ca.SX(generator.normal(size=3)), ca.SX(generator.normal(size=3))

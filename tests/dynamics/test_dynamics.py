@@ -54,7 +54,8 @@ def build(model: pin.Model, frame: int) -> Symbolic:
     world, local = Wrench(point, w[:3], w[3:]), Wrench(point, w[:3], w[3:], in_frame=True)
     at_v = tree.velocities(v)
     solved, other = tree.respond(tau=tau, wrenches=[world]), tree.respond(tau=u, wrenches=[local])
-    rates = solved.velocities
+    rates, lean = solved.velocities, Tree(model, q, visits=[])
+    both = lean.respond(tau=tau, wrenches=[world]), lean.respond(tau=u, wrenches=[local])
     outputs = {
         "M": composite_mass_matrix(tree),
         "M v": tree.mass_times(v),
@@ -73,6 +74,7 @@ def build(model: pin.Model, frame: int) -> Symbolic:
         "J v": tree.point_velocity(point, at_v),
         "gradient vMv": tree.energy_gradient(at_v),
         "gradient of a pair": tree.pair_gradient(solved, other),
+        "lean gradient of a pair": lean.pair_gradient(*both),
     }
     names = list(outputs)
     all_fun = ca.Function(
@@ -89,7 +91,7 @@ def build(model: pin.Model, frame: int) -> Symbolic:
 OUTPUTS = (
     "M", "M v", "M v of known velocities", "solve", "solve with wrench", "solve with wrench in frame",
     "solve's velocities", "velocities", "force", "force in frame", "two forces", "position", "rotation", "com", "J v",
-    "gradient vMv", "gradient of a pair",
+    "gradient vMv", "gradient of a pair", "lean gradient of a pair",
 )  # fmt: skip
 
 
@@ -137,6 +139,7 @@ def compare(symbolic: Symbolic, q: Vector, generator: np.random.Generator) -> No
         "gradient vMv": (numeric.inertial_gradient(v, v), np.abs(v) @ np.abs(M @ v)),
         "gradient of a pair": (sum(gradient for gradient, _ in terms), max(scale for _, scale in terms)),
     }
+    gradients["lean gradient of a pair"] = gradients["gradient of a pair"]
     for name, (value, scale) in gradients.items():
         assert_close(result[name], value, TOLERANCE, name, scale)
     quaternion, position = (np.array(o).reshape(-1) for o in symbolic.chart_fun(symbolic.chart.to_x(q)))

@@ -16,7 +16,7 @@ import pinocchio as pin
 
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.repeated_limbs import RepeatedLimbs
-from impact_posture.dynamics.tree import ByJoint, PointOnLink, Response, Tree, Wrench
+from impact_posture.dynamics.tree import ByJoint, PointOnLink, Response, Tree, Visits, Wrench
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.quantities.lifted_form import impact_at, in_world
 from impact_posture.impact.support_compliance import support_inertia
@@ -32,13 +32,21 @@ class ImpactKernel:
 
     The symbol ``q`` has shape (nq, 1).  The symbol ``n``, shape (3, 1), is the normal in the axes ``normal_frame`` of
     the contact.  With ``limbs``, the expressions of repeated limbs (:class:`RepeatedLimbs`) differ only in
-    parameters.
+    parameters.  ``visits`` is the argument of :class:`~impact_posture.dynamics.tree.Tree`.
     """
 
-    def __init__(self, case: ImpactCase, q: ca.SX, n: ca.SX, limbs: RepeatedLimbs | None = None) -> None:
+    def __init__(
+        self,
+        case: ImpactCase,
+        q: ca.SX,
+        n: ca.SX,
+        limbs: RepeatedLimbs | None = None,
+        visits: Visits | None = None,
+    ) -> None:
         self.case, self.metric, self.q, self.n = case, case.metric, q, n
         extra = support_inertia(case.robot, case.supports, case.compliance)
-        self.tree = Tree(case.robot.model, q, extra_inertia=extra, limbs=limbs, couplings=case.robot.coupled_entries)
+        couplings = case.robot.coupled_entries
+        self.tree = Tree(case.robot.model, q, None, extra, limbs, couplings, visits)
         self.point = case.point
         self._supported = bool(case.supports)
 

@@ -62,7 +62,8 @@ class ModelSet:
         for member in self.members:
             # A model with a payload on one limb has other repeated limbs, so it needs its own kernel.
             case = member.oracle.case
-            pairs.append(member.expressions(k if case.robot is k.case.robot else ImpactKernel(case, k.q, k.n)))
+            same = case.robot is k.case.robot
+            pairs.append(member.expressions(k if same else ImpactKernel(case, k.q, k.n, visits=k.tree.visits)))
         return first_of_largest([value for value, _ in pairs], [gradient for _, gradient in pairs])
 
     def lift(self, tree: Tree, parameters: ca.SX, scale: ca.SX) -> Lifted:

@@ -108,7 +108,7 @@ class NormalCone:
         R = in_world(k.case, k.tree, ca.SX.eye(3))
         K = R.T @ self.kind.form_expression(k) @ R
         n = worst_normal_symbolic((K + K.T) / 2, k.n, self.degrees)
-        return self.kind.expressions(ImpactKernel(k.case, k.q, n, k.tree.limbs))
+        return self.kind.expressions(ImpactKernel(k.case, k.q, n, k.tree.limbs, k.tree.visits))
 
     def lift(self, tree: Tree, parameters: ca.SX, scale: ca.SX) -> Lifted:
         """Return the dual problem; its unknowns are three jumps, ``τ``, ``ρ`` and the six entries of ``L``."""
