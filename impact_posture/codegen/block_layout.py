@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 from collections import Counter
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Collection, Mapping, Sequence, Set
 from dataclasses import dataclass
 
 from impact_posture.codegen.expression_graph import ARITHMETIC, COSINE, SINE, Graph
@@ -40,6 +40,8 @@ class Layout:
         angles: Input nodes whose sine and cosine are computed, in the order of the arrays of sines and cosines.
         trig: Sine or cosine node → index of its first value in the array of sines or cosines.
         leaves: Nodes that need no statement: constants, inputs, lanes, and sines and cosines of inputs.
+        shared: Nodes whose values are in the array that the warps of a CUDA block share, not in the work array.
+        shared_size: Length of this array for one configuration.
     """
 
     graph: Graph
@@ -50,6 +52,8 @@ class Layout:
     angles: tuple[int, ...]
     trig: Mapping[int, int]
     leaves: frozenset[int]
+    shared: frozenset[int] = frozenset()
+    shared_size: int = 0
 
 
 def lay_out(
@@ -61,8 +65,8 @@ def lay_out(
     the functions need; by default, the order is depth first.
     """
     order = order or depth_first(graph, [k for names in functions for name in names for k in graph.outputs[name]])
-    angles, trig = _trig(graph, order)
-    leaves = frozenset(k for k in order if graph.nodes[k].op in ("const", "in", "lane") or k in trig)
+    angles, trig = trig_nodes(graph, order)
+    leaves = leaves_of(graph, order)
     needed = _needed(graph, functions, leaves)
     # Remove nodes that only the arrays of sines and cosines need, because no statement computes them.
     order = [k for k in order if k in needed]
@@ -71,7 +75,7 @@ def lay_out(
         for a in set(_sources(graph, leaves, k)):
             users.setdefault(a, []).append(k)
     outputs = {_source(graph, k) for names in functions for name in names for k in graph.outputs[name]}
-    inlined = _inlined(graph, [k for k in order if k not in leaves], users, outputs, needed)
+    inlined = inlined_nodes(graph, [k for k in order if k not in leaves], users, outputs, needed)
     groups: dict[frozenset[int], list[int]] = {}
     for k in order:
         if k not in inlined and k not in leaves:
@@ -90,24 +94,26 @@ def lay_out(
         return at[k]
 
     last = {k: len(blocks) if k in outputs else max((home(u) for u in users.get(k, ())), default=-1) for k in at}
-    slots, sizes = _slots(graph, blocks, last)
+    slots, sizes = assign_slots(graph, [part.nodes for part in blocks], last)
     return Layout(graph, tuple(blocks), frozenset(inlined), slots, sizes, angles, trig, leaves)
 
 
-def _slots(graph: Graph, blocks: Sequence[Block], last: Mapping[int, int]) -> tuple[dict[int, int], dict[int, int]]:
-    """Return indices in the work arrays for values that later blocks use, and the lengths of the arrays.
+def assign_slots(
+    graph: Graph, steps: Sequence[Sequence[int]], last: Mapping[int, int]
+) -> tuple[dict[int, int], dict[int, int]]:
+    """Return indices in the work arrays for values that later steps use, and the lengths of the arrays.
 
-    All functions call blocks in the same order.  Therefore, the index of a value can be used again after the block
-    ``last[value]``, which is the last to use the value.
+    ``steps`` contains the nodes that each step computes; a step is a block, or several blocks that run at once.
+    ``last[value]`` is the last step that uses the value.  After this step, another value can have the same index.
     """
     slots: dict[int, int] = {}
     sizes: dict[int, int] = {}
     free: dict[int, list[int]] = {}
     ending: dict[int, list[int]] = {}
-    for number, block in enumerate(blocks):
+    for number, step in enumerate(steps):
         for k in ending.pop(number - 1, ()):
             heapq.heappush(free.setdefault(graph.nodes[k].width, []), slots[k])
-        for k in block.nodes:
+        for k in step:
             if last[k] <= number:
                 continue
             width = graph.nodes[k].width
@@ -129,14 +135,19 @@ def _sources(graph: Graph, leaves: Set[int], k: int) -> list[int]:
     return [] if k in leaves else [_source(graph, a) for a in graph.nodes[k].operands]
 
 
-def depth_first(graph: Graph, roots: Sequence[int]) -> list[int]:
+def leaves_of(graph: Graph, order: Sequence[int]) -> frozenset[int]:
+    """Return the nodes of ``order`` that need no statement, as in :attr:`Layout.leaves`."""
+    trig = trig_nodes(graph, order)[1]
+    return frozenset(k for k in order if graph.nodes[k].op in ("const", "in", "lane") or k in trig)
+
+
+def depth_first(graph: Graph, roots: Sequence[int], known: Collection[int] = ()) -> list[int]:
     """Return the nodes that the roots need.  Each operand comes shortly before the operation that uses the operand.
 
-    The operand with the longest chain of operations comes last, so that its result is used immediately.
+    The operand with the longest chain of operations comes last, so that its result is used immediately.  The nodes
+    ``known`` are left out.
     """
-    depth: list[int] = []
-    for node in graph.nodes:
-        depth.append((node.op in ARITHMETIC) + max((depth[a] for a in node.operands), default=0))
+    depth = graph.depths
     seen: set[int] = set()
     order: list[int] = []
     for root in roots:
@@ -145,7 +156,7 @@ def depth_first(graph: Graph, roots: Sequence[int]) -> list[int]:
             k, ready = stack.pop()
             if ready:
                 order.append(k)
-            elif k not in seen:
+            elif k not in seen and k not in known:
                 seen.add(k)
                 stack.append((k, True))
                 operands = sorted(graph.nodes[k].operands, key=lambda a: -depth[a])
@@ -153,7 +164,7 @@ def depth_first(graph: Graph, roots: Sequence[int]) -> list[int]:
     return order
 
 
-def _trig(graph: Graph, order: Sequence[int]) -> tuple[tuple[int, ...], dict[int, int]]:
+def trig_nodes(graph: Graph, order: Sequence[int]) -> tuple[tuple[int, ...], dict[int, int]]:
     """Return ``angles`` and ``trig`` of :class:`Layout`; vectors come first, so that they are aligned in memory."""
     trigonometric = [k for k in order if graph.nodes[k].op in (SINE, COSINE)]
     starts: dict[int, int] = {}
@@ -183,7 +194,7 @@ def _needed(graph: Graph, functions: Sequence[Sequence[str]], leaves: Set[int]) 
     return {k: frozenset(v) for k, v in numbers.items()}
 
 
-def _inlined(
+def inlined_nodes(
     graph: Graph,
     order: Sequence[int],
     users: Mapping[int, list[int]],

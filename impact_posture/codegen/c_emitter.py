@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from impact_posture.codegen.block_layout import Block, Layout
 from impact_posture.codegen.c_literals import Real
 from impact_posture.codegen.expression_graph import COSINE, Node
+from impact_posture.codegen.limb_warps import LANES
 
 # Number of characters of a reference to a table of constants, such as K[1234].  Shorter literals are written
 # directly.
@@ -21,9 +22,9 @@ _PLACE = 7
 SHORT_NAMES = ("APART", "K", "K2", "K4", "V2", "V2u", "V4", "V4u", "VN")
 """Names of the macros that the generated C file defines, and undefines at its end."""
 
-# Arrays that can be parameters of a block in addition to the inputs: sines, cosines, and a work array for each vector
-# width.
-_SHARED = ("s", "c", "w", "w2", "w4")
+# Arrays that can be parameters of a block in addition to the inputs: sines, cosines, a work array for each vector
+# width, and the array that the warps of a CUDA block share.
+_SHARED = ("s", "c", "w", "w2", "w4", "wx")
 # A compiler splits vectors that are wider than the vectors of the processor.  Without optimization, the compiler
 # stores the whole vector and its parts, which takes twice the stack.
 _HALVES = 2
@@ -127,7 +128,7 @@ class Emitter:
             return f"{work if self._work else ''}{self._graph.inputs[node.args[0]]}[{node.args[1]}]"
         if k in self.layout.trig:
             return f"{work}{'c' if node.op == COSINE else 's'}[{self.layout.trig[k]}]"
-        return f"{work}{self._slot(k)}"
+        return self._slot(k) if k in self.layout.shared else f"{work}{self._slot(k)}"
 
     def _block(self, number: int, block: Block) -> BlockText:
         names: dict[int, str] = {}
@@ -156,9 +157,9 @@ class Emitter:
         for name in _SHARED:
             if name in present:
                 constant = "const " if name in "sc" else ""
-                kind = self._types[int(name[1:] or 1)]
+                kind = self._types[1 if name == "wx" else int(name[1:] or 1)]
                 parameters.append(f"{constant}{kind} *{name}")
-                arguments.append(f"{self._work or 'm'}.{name}")
+                arguments.append(name if name == "wx" else f"{self._work or 'm'}.{name}")
         title = f"{self._prefix}_block{number}"
         local = sum(self._graph.nodes[k].width for k in names) * self._size
         return BlockText(
@@ -218,5 +219,7 @@ class Emitter:
         return names[k]
 
     def _slot(self, k: int) -> str:
+        if k in self.layout.shared:
+            return f"wx[{self.layout.slots[k]}*{LANES}]"
         width = self._graph.nodes[k].width
         return f"w{width if width > 1 else ''}[{self.layout.slots[k]}]"

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
 
-from impact_posture.codegen.block_layout import Layout, lay_out
+from impact_posture.codegen.block_layout import lay_out
 from impact_posture.codegen.c_emitter import BlockText, Constants, Emitter
 from impact_posture.codegen.c_literals import Real
-from impact_posture.codegen.export_functions import SIGNATURES, lengths
+from impact_posture.codegen.cuda_source import CudaSource, build_cuda_source
 from impact_posture.codegen.export_library import Exported, ExportLibrary, NamedObjective, export_library
 from impact_posture.codegen.expression_graph import ARITHMETIC, Graph
-from impact_posture.codegen.limb_order import limb_of_coordinates, order_by_limb
+from impact_posture.codegen.function_text import angles_of, assignments, function_variables
 from impact_posture.codegen.sum_order import reorder_sums
 from impact_posture.config.cached_values import cached
 from impact_posture.system.libraries import source_key
@@ -32,29 +32,6 @@ _SPILL = 2
 # Largest number of statements in a block of a batch.  A block of this size fits the first-level cache while it
 # computes one group of configurations after the other.
 _BATCH_BLOCK = 60
-
-# Up to this number of operations, the blocks of a CUDA function are inlined, so that values can stay in registers.
-# In longer functions, separate blocks make the compiler store fewer values in memory.
-_INLINED = 6000
-# Largest number of statements in a CUDA block that is not inlined.  On an H100, talos in double precision reaches
-# 105 million evaluations/s with 600 statements, 95 million with 300, and 91 million with 200 or 1,000.
-_CUDA_BLOCK = 600
-
-
-@dataclass(frozen=True)
-class CudaSource:
-    """CUDA code of all functions of an export.  Each function has its own blocks.
-
-    Attributes:
-        inlined: Whether the blocks are inlined.
-        constants: Definitions of the tables of constants.
-        functions: Template variables of each function: the variables in :attr:`CSource.functions`, ``blocks``,
-            ``angles`` and ``work`` (length of the work array).
-    """
-
-    inlined: bool
-    constants: str
-    functions: tuple[dict[str, Any], ...]
 
 
 @dataclass(frozen=True)
@@ -99,20 +76,25 @@ def build_c_source(
     ``portable`` code does not use vectors, so compilers other than GCC and Clang can compile it.  With ``cuda``, also
     generate CUDA code.
     """
-    library = export_library(exported)
+    library, lean = export_library(exported), export_library(exported, lean=True) if cuda else None
     models = [
         (v.stem, v.joint, v.free, v.objective.contact, v.objective.scale, v.objective.is_multiple_of_H)
         for v in exported
     ]
-    content = (library.constants, library.seeds, library.functions, models, prefix, real, portable, cuda)
-    key = source_key([ca.CasadiMeta.version(), repr(content), library.function.serialize()], "codegen")
-    return cached(
-        "code", key, CSource, lambda: _generate(exported, library, prefix, real, portable=portable, cuda=cuda)
-    )
+    content = (library.constants, library.seeds, library.functions, models, prefix, real, portable)
+    functions = [each.function.serialize() for each in (library, lean) if each is not None]
+    key = source_key([ca.CasadiMeta.version(), repr(content), *functions], "codegen")
+    return cached("code", key, CSource, lambda: _generate(exported, library, lean, prefix, real, portable=portable))
 
 
 def _generate(
-    exported: Sequence[NamedObjective], library: ExportLibrary, prefix: str, real: Real, *, portable: bool, cuda: bool
+    exported: Sequence[NamedObjective],
+    library: ExportLibrary,
+    lean: ExportLibrary | None,
+    prefix: str,
+    real: Real,
+    *,
+    portable: bool,
 ) -> CSource:
     single = [v for v in exported if not v.joint]
     # The code of an objective of several contacts contains the normal of its first contact.
@@ -127,14 +109,14 @@ def _generate(
     # The names of types occur thousands of times, so they are short macros.
     types = {1: real.name, 2: "V2", 4: "V4"}
     emitter = Emitter(layout, prefix, real, types, constants)
-    angles = _angles(layout)
+    angles = angles_of(layout)
     whole = 1 if portable else LARGEST_VECTOR // real.size
     room = max(1, -(-len(angles) // whole)) * whole
     functions = []
     for number, function in enumerate(library.functions):
         blocks = zip(layout.blocks, emitter.blocks, strict=True)
         calls = [text.call for block, text in blocks if number in block.functions]
-        functions.append(_variables(function, emitter, calls, normals))
+        functions.append(function_variables(function, emitter, calls, normals))
     numbers = sum(width * count for width, count in layout.sizes.items()) + 3 * room
     frames = [max(_SPILL * b.local_bytes, b.local_bytes + b.wide_bytes) for b in emitter.blocks]
     largest = real.size * numbers + max(frames, default=0)
@@ -151,50 +133,13 @@ def _generate(
             batch |= lanes
         batches.append(batch)
     work = [(types[width], f"w{width if width > 1 else ''}", count) for width, count in sorted(layout.sizes.items())]
-    limb_of = limb_of_coordinates(robot.model)
-    cuda_source = _cuda(library, scalars, limb_of, normals, prefix, real) if cuda else None
+    scales = {batch["stem"]: batch["scale"] for batch in batches}
+    cuda_source = build_cuda_source(lean, robot.model, normals, scales, prefix, real) if lean else None
     stack_bytes = -(-(largest + _FRAMES) // 64) * 64
     return CSource(
         portable, constants.text(types), tuple(emitter.blocks), angles, room, tuple(work), tuple(functions),
         tuple(batches), stack_bytes, cuda_source,
     )  # fmt: skip
-
-
-def _cuda(
-    library: ExportLibrary,
-    scalars: Graph,
-    limb_of: Mapping[int, int],
-    normals: Mapping[str, Sequence[float]],
-    prefix: str,
-    real: Real,
-) -> CudaSource:
-    orders = [order_by_limb(scalars, function.outputs, limb_of) for function in library.functions]
-    longest = max(map(len, orders))
-    block = longest if (inlined := longest <= _INLINED) else _CUDA_BLOCK
-    constants = Constants(prefix, real, "static __constant__ const")
-    functions = []
-    for function, order in zip(library.functions, orders, strict=True):
-        layout = lay_out(scalars, [function.outputs], block, order)
-        emitter = Emitter(layout, f"{function.stem}_{function.name}", real, {1: real.name}, constants)
-        variables = _variables(function, emitter, [b.call for b in emitter.blocks], normals)
-        work = layout.sizes.get(1, 0)
-        functions.append(variables | {"blocks": emitter.blocks, "angles": _angles(layout), "work": work})
-    return CudaSource(inlined, constants.text({1: real.name}), tuple(functions))
-
-
-def _variables(
-    function: Exported, emitter: Emitter, calls: Sequence[str], normals: Mapping[str, Sequence[float]]
-) -> dict[str, Any]:
-    inputs, results = SIGNATURES[function.name]
-    sizes = [len(emitter.layout.graph.outputs[output]) for output in function.outputs]
-    return {
-        "stem": function.stem,
-        "name": function.name,
-        "normal": None if "n" in inputs else normals[function.stem],
-        "calls": calls,
-        "outputs": [*_outputs(function, emitter, "m.")],
-        "finite": [*zip(results, sizes, strict=True)],
-    }
 
 
 def _lanes(function: Exported, scalars: Graph, real: Real, constants: Constants) -> dict[str, Any]:
@@ -206,22 +151,9 @@ def _lanes(function: Exported, scalars: Graph, real: Real, constants: Constants)
     emitter = Emitter(layout, f"{function.stem}_lanes", real, {1: "VN"}, constants, LARGEST_VECTOR, "work[g]")
     return {
         "blocks": emitter.blocks,
-        "angles": _angles(layout),
+        "angles": angles_of(layout),
         # An array in C cannot have the length zero.
         "room": max(1, len(layout.angles)),
         "work": layout.sizes.get(1, 1),
-        "outputs": [*_outputs(function, emitter, "m->")],
+        "outputs": [*assignments(function, emitter, "m->")],
     }
-
-
-def _angles(layout: Layout) -> tuple[int, ...]:
-    return tuple(layout.graph.nodes[k].args[1] for k in layout.angles)
-
-
-def _outputs(function: Exported, emitter: Emitter, work: str) -> Iterator[dict[str, Any]]:
-    """Yield the assignments of the results of a function; names of work arrays begin with ``work``."""
-    graph, arrays = emitter.layout.graph, lengths(0, 0)
-    for name, output in zip(SIGNATURES[function.name][1], function.outputs, strict=True):
-        for k, node in enumerate(graph.outputs[output]):
-            target, value = f"{name}[{k}]" if name in arrays else f"*{name}", emitter.output(node, work)
-            yield {"target": target, "value": value, "constant": graph.nodes[node].op == "const"}

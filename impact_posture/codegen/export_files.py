@@ -18,6 +18,7 @@ from impact_posture.codegen.c_literals import DOUBLE, Real, brace_initializer
 from impact_posture.codegen.c_source import CSource
 from impact_posture.codegen.export_functions import BLOCK_THREADS, SIGNATURES, lengths
 from impact_posture.codegen.export_library import NamedObjective
+from impact_posture.codegen.limb_warps import LANES, WARPS
 from impact_posture.codegen.manifest_reader import identity
 from impact_posture.codegen.self_test import self_test_tolerance
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
@@ -171,6 +172,8 @@ def _context(
         "unit_bounds": [real.literal(float(f"{(1 + sign * real.unit_tolerance) ** 2:.12f}")) for sign in (-1, 1)],
         "macros": SHORT_NAMES,
         "block": BLOCK_THREADS,
+        "warps": WARPS,
+        "lanes": LANES,
         "signatures": SIGNATURES,
         "sizes": sizes,
         "kernels": [

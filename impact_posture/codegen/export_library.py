@@ -11,6 +11,7 @@ from impact_posture.codegen.export_functions import stems
 from impact_posture.codegen.expression_graph import Graph, graph_of
 from impact_posture.codegen.simd_lanes import LimbInput, pack_lanes
 from impact_posture.dynamics.chart import Chart
+from impact_posture.dynamics.kinematics import Visits
 from impact_posture.dynamics.repeated_limbs import RepeatedLimbs
 from impact_posture.errors import InputError
 from impact_posture.impact.quantities.impact_kernel import ImpactKernel
@@ -86,12 +87,14 @@ class ExportLibrary:
         constants: Values of the input ``constants``, which contains the constants in which repeated limbs differ.
         seeds: (input name, index) → limb to which the input belongs.
         functions: Name and outputs of each C function.
+        joints: For each entry of the output ``visits``, the joint at which a sweep computes it.
     """
 
     function: ca.Function
     constants: tuple[float, ...]
     seeds: Mapping[tuple[str, int], LimbInput]
     functions: tuple[Exported, ...]
+    joints: tuple[int, ...] = ()
 
     def graph(self) -> Graph:
         """Return the graph of operations on single numbers, with numbers in place of the input ``constants``."""
@@ -107,8 +110,11 @@ class ExportLibrary:
         return pack_lanes(graph_of(self.function), self.seeds, {"constants": self.constants})
 
 
-def export_library(exported: Sequence[NamedObjective]) -> ExportLibrary:
+def export_library(exported: Sequence[NamedObjective], *, lean: bool = False) -> ExportLibrary:
     """Return the expressions of the objectives of one robot.
+
+    ``lean`` expressions need few values at a time, but more operations.  Their additional output ``visits`` contains
+    the values of the sweeps in their order.
 
     ``V`` has no expression, because the C code computes it from ``H`` and ``G``.  If ``objective`` is a multiple of
     ``H``, the C code computes it from ``H``, so it has no expression either.
@@ -118,8 +124,9 @@ def export_library(exported: Sequence[NamedObjective]) -> ExportLibrary:
     limbs = RepeatedLimbs(model, robot.coupled_joints)
     outputs: dict[str, ca.SX] = {}
     functions: list[Exported] = []
+    visits: Visits | None = [] if lean else None
     for number, v in enumerate(exported):
-        k = ImpactKernel(v.objective.case, q, n, limbs)
+        k = ImpactKernel(v.objective.case, q, n, limbs, visits)
         parts: dict[str, dict[str, ca.SX]] = {}
         if not v.joint:
             parts["eval"], parts["value"] = {"H": k.H, "grad": k.grad_H}, {"H": k.H}
@@ -131,11 +138,14 @@ def export_library(exported: Sequence[NamedObjective]) -> ExportLibrary:
             part_outputs = {f"o{number}_{output}": value for output, value in part.items()}
             functions.append(Exported(v.stem, name, tuple(part_outputs)))
             outputs |= part_outputs
+    if visits is not None:
+        outputs["visits"] = ca.vertcat(*[values for _, values in visits])
+    joints = tuple(joint for joint, values in visits or () for _ in range(values.numel()))
     constants = [value for _, value in limbs.parameters.values()]
     inputs = [q, n, ca.vertcat(ca.SX(0, 1), *[symbol for symbol, _ in limbs.parameters.values()])]
     names = ["q", "n", "constants"], [*outputs]
     function = ca.Function("library", inputs, [*outputs.values()], *names, {"cse": True})
-    return ExportLibrary(function, tuple(constants), _seeds(model, limbs), tuple(functions))
+    return ExportLibrary(function, tuple(constants), _seeds(model, limbs), tuple(functions), joints)
 
 
 def _seeds(model: object, limbs: RepeatedLimbs) -> dict[tuple[str, int], LimbInput]:

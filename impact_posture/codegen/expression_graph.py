@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import NamedTuple
 
 import casadi as ca
@@ -76,6 +77,14 @@ class Graph:
     nodes: list[Node] = field(default_factory=list)
     outputs: dict[str, list[int]] = field(default_factory=dict)
     _known: dict[Node, int] = field(default_factory=dict)
+
+    @cached_property
+    def depths(self) -> list[int]:
+        """Number of arithmetic operations on the longest chain that ends at each node, for a complete graph."""
+        depths: list[int] = []
+        for node in self.nodes:
+            depths.append((node.op in ARITHMETIC) + max((depths[a] for a in node.operands), default=0))
+        return depths
 
     def add(self, node: Node) -> int:
         """Return the number of a node, and add the node if it is new.

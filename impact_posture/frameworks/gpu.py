@@ -7,6 +7,7 @@ Arrays of every package with the DLPack protocol are accepted: NumPy, CuPy, PyTo
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
@@ -174,7 +175,10 @@ class BatchMetric:
             with cupy.cuda.Device(device):
                 module = cupy.RawModule(code=code, options=options, backend="nvrtc", name_expressions=(expression,))
                 function = module.get_function(expression).kernel
-            kernel = self._kernels[name, device] = Kernel(function, BLOCK_THREADS, BLOCK_THREADS, 0)
+            # An earlier version wrote a header without this macro; there, each thread computes a row.
+            rows = re.search(r"^#define \w+_ROWS (\d+)$", code, re.MULTILINE)
+            kernel = Kernel(function, BLOCK_THREADS, int(rows[1]) if rows else BLOCK_THREADS, 0)
+            self._kernels[name, device] = kernel
         return kernel
 
     def normalized(self, xp: Any, q: Any) -> tuple[Any, Any]:

@@ -1,4 +1,5 @@
-// Time the kernel of an export, and compare its results with the samples.  run.py defines HEADER, KERNEL, REAL and THREADS.
+// Time the kernel of an export, and compare its results with the samples.  run.py defines HEADER, KERNEL, REAL,
+// THREADS, and ROWS (rows of a block).
 #include HEADER
 
 #include <algorithm>
@@ -58,7 +59,7 @@ int main(int argc, char **argv)
   int resident = 0;
   check(cudaOccupancyMaxActiveBlocksPerMultiprocessor(&resident, kernel, THREADS, 0));
   const auto launch = [&](int rows) {
-    kernel<<<(rows + THREADS - 1) / THREADS, THREADS>>>(dq, dn, count, rows, dH, dgrad, dstatus);
+    kernel<<<(rows + ROWS - 1) / ROWS, THREADS>>>(dq, dn, count, rows, dH, dgrad, dstatus);
   };
   cudaEvent_t start, stop;
   check(cudaEventCreate(&start));
