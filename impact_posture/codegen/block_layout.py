@@ -199,9 +199,12 @@ def inlined_nodes(
     order: Sequence[int],
     users: Mapping[int, list[int]],
     outputs: set[int],
-    needed: Mapping[int, frozenset[int]],
+    needed: Mapping[int, object],
 ) -> set[int]:
-    """Return the arithmetic operations that only one other arithmetic operation of the same functions uses."""
+    """Return the arithmetic operations that only one other arithmetic operation uses.
+
+    Both operations must have the same value in ``needed``, such as the functions that need them.
+    """
     size: dict[int, int] = {}
     inlined: set[int] = set()
     for k in order:

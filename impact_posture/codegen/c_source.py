@@ -133,7 +133,7 @@ def _generate(
             batch |= lanes
         batches.append(batch)
     work = [(types[width], f"w{width if width > 1 else ''}", count) for width, count in sorted(layout.sizes.items())]
-    scales = {batch["stem"]: batch["scale"] for batch in batches}
+    scales = {str(batch["stem"]): str(batch["scale"]) for batch in batches}
     cuda_source = build_cuda_source(lean, robot.model, normals, scales, prefix, real) if lean else None
     stack_bytes = -(-(largest + _FRAMES) // 64) * 64
     return CSource(

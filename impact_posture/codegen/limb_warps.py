@@ -136,12 +136,12 @@ def lay_out_warps(graph: Graph, outputs: Sequence[str], plan: WarpSchedule) -> L
     for k in order:
         for a in set(graph.nodes[k].operands):
             users.setdefault(a, []).append(k)
-    place = {k: frozenset([(plan.stages[k], plan.warps[k])]) for k in order}
+    place = {k: (plan.stages[k], plan.warps[k]) for k in order}
     inlined = inlined_nodes(graph, order, users, results, place)
     blocks: dict[tuple[int, int], list[int]] = {}
     for k in order:
         if k not in inlined:
-            blocks.setdefault((plan.stages[k], plan.warps[k]), []).append(k)
+            blocks.setdefault(place[k], []).append(k)
     steps = [[k for at, nodes in blocks.items() if at[0] == stage for k in nodes] for stage in range(plan.count)]
     computed = [k for step in steps for k in step]
     # A node within a statement is in the same stage as the statement, so the last stage of the users is correct.

@@ -55,7 +55,7 @@ def build_gpu(case: Case, architecture: str) -> str:
         return ""
     defined = {
         "HEADER": f'"{case["header"]}"', "KERNEL": f"{case['prefix']}_eval_kernel", "REAL": case["real"],
-        "THREADS": case["threads"],
+        "THREADS": case["threads"], "ROWS": f"{case['prefix'].upper()}_ROWS",
     }  # fmt: skip
     line = ["nvcc", "-std=c++17", "-O3", f"-arch={architecture}", *[f"-D{k}={v}" for k, v in defined.items()]]
     answer = run([*line, "bench.cu", "-o", program(case)], 300)

@@ -14,9 +14,10 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 
+from impact_posture.dynamics.kinematics import Visits
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.repeated_limbs import RepeatedLimbs
-from impact_posture.dynamics.tree import ByJoint, PointOnLink, Response, Tree, Visits, Wrench
+from impact_posture.dynamics.tree import ByJoint, PointOnLink, Response, Tree, Wrench
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.quantities.lifted_form import impact_at, in_world
 from impact_posture.impact.support_compliance import support_inertia
