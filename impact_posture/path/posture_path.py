@@ -239,7 +239,10 @@ def _struck(
         enough = max(run.strike.speed for _, run in slower) / _FASTER
         k, run = slower.pop(next(i for i, (_, run) in enumerate(slower) if run.strike.speed >= enough))
         led = _led(solution.initial, run, limits, seed, effort)
-        best = None if isinstance(led, str) else (k, *led)
+        if not isinstance(led, str):
+            best = k, *led
+        elif k == 0:
+            failure = led
     if best is None:
         return failure or "no optimum allows a strike"
     k, run, method = best

@@ -232,6 +232,18 @@ def test_a_run_up_is_not_shorter_than_a_controller_can_follow(tmp_path: Path) ->
     )
 
 
+def test_the_reason_is_the_missing_path_if_another_optimum_is_not_faster(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    solution, module = slider(tmp_path, 4.0, 9.0), "impact_posture.path.posture_path"
+    monkeypatch.setattr(f"{module}._targets", lambda solution, space: enumerate([solution.q, solution.q]))
+    answers = iter(["no path leads to the beginning of the run-up"])
+    monkeypatch.setattr(f"{module}._led", lambda start, run, *_: next(answers, (run, "continuation")))
+    path = posture_path(solution, strike=2.0)
+    assert path.strike is not None and path.strike.hindrance
+    assert path.reason.startswith("no path leads to the beginning of the run-up; the path ends at optimum number 2")
+
+
 def test_a_velocity_limit_bounds_the_speed(tmp_path: Path) -> None:
     path = posture_path(slider(tmp_path, 4000.0, 0.7), strike=2.0)
     assert path.strike is not None and path.strike.hindrance == "the velocity of slide"

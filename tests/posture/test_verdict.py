@@ -115,7 +115,7 @@ def test_a_posture_that_cannot_arrive_says_so_first() -> None:
     impact = resolved("panda")
     q = impact.evaluate()
     told = verdict(impact, q, q, Circumstances(attainable=0.0163))
-    assert told.line.startswith("verdict: cannot arrive at 1 m/s (0.016 m/s at most)")
+    assert told.line.startswith("verdict: cannot arrive at 1 m/s (0.0163 m/s at most)")
     assert told.outcome == "cannot arrive" and any("`approach`" in line for line in told.advice)
     reached = verdict(impact, q, q, Circumstances(attainable=0.999))
     assert "arrival" not in [condition.key for condition in reached.conditions]

@@ -81,7 +81,7 @@ def _arrival(impact: ResolvedImpact, known: Circumstances) -> Iterator[Condition
     if known.attainable is not None and known.attainable < (1 - _REACHED) * impact.speed:
         yield Condition(
             "arrival",
-            f"cannot arrive at {impact.speed:g} m/s ({known.attainable:.2g} m/s at most)",
+            f"cannot arrive at {impact.speed:g} m/s ({known.attainable:.3g} m/s at most)",
             "lower the `speed`, or free the pose (`contact_pose`)" if known.strikes else _SLOW,
             refutes=True,
         )
