@@ -92,7 +92,7 @@ def optimize(
             result = result.trade_off(settings.tradeoff, settings.tradeoff_against, compile=compile, progress=advance)
     if settings.path:
         with page.progress("planning", "paths", first="searching a path to the optimum"):
-            result = result.path(seed=settings.seed, strike=settings.strike)
+            result = result.path(seed=settings.seed, strike=settings.strike, jobs=jobs)
     if not json:
         # Print the result first, because writing figures and C code takes longer.
         summarize(page, prepared, result.solution, result.document)

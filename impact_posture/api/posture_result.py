@@ -166,7 +166,7 @@ class PostureResult:
         return replace(self, tradeoff=curve)
 
     @checked
-    def path(self, *, seed: ZeroOrMore = 0, strike: bool = False) -> PostureResult:
+    def path(self, *, seed: ZeroOrMore = 0, strike: bool = False, jobs: OneOrMore = JOBS) -> PostureResult:
         """Return this result with a timed path from the initial posture to the optimum added.
 
         The timing respects the robot's limits (:func:`~impact_posture.path.posture_path.posture_path`).  If no path
@@ -177,6 +177,7 @@ class PostureResult:
             seed: Seed of the sampling planner.
             strike: Whether the path ends with an impact instead of at rest (:mod:`~impact_posture.path.strike`).  The
                 contact point then arrives with the approach speed of the problem, after a run-up along the normal.
+            jobs: Number of processes that compute the stops after the considered impacts.
 
         Raises:
             InputError: The package TOPP-RA (``impact-posture[path]``) is not installed, or the contact cannot strike.
@@ -186,7 +187,9 @@ class PostureResult:
         if not strike:
             return replace(self, motion=posture_path(self.solution, seed=seed))
         impact = self._prepared.impact
-        motion = posture_path(self.solution, seed=seed, strike=impact.speed, restitution=impact.restitution)
+        motion = posture_path(
+            self.solution, seed=seed, strike=impact.speed, restitution=impact.restitution, jobs=jobs
+        )
         return replace(self, motion=motion)
 
     @checked

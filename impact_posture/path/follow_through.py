@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -15,12 +15,10 @@ from impact_posture.impact.friction.contact_impulses import contact_impulses
 from impact_posture.impact.impact_contact import point_on
 from impact_posture.impact.worst_case.worst_normal import cone_axes
 from impact_posture.path.actuator_limits import ActuatorLimits
-from impact_posture.path.path_curve import PathCurve
 from impact_posture.path.path_space import PathSpace
 from impact_posture.path.row_interpolation import Moment, RowInterpolation
 from impact_posture.path.strike_spaces import StrikeSpaces, landed
 from impact_posture.path.stroke import shortest_stroke
-from impact_posture.path.time_law import TimeLaw
 from impact_posture.path.timed_curve import moment, sampled
 from impact_posture.posture.constraints.clearance import Clearance
 from impact_posture.posture.formulation.landing import falls_freely
@@ -28,6 +26,7 @@ from impact_posture.posture.program.certificate import linearized_limits
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem, equality_jacobian
 from impact_posture.robot.support_polygon import polygon_edges
 from impact_posture.system.arrays import Array
+from impact_posture.system.processes import fork_map
 
 # Coefficients of restitution of the considered impacts (:attr:`FollowThrough.impacts`).
 RESTITUTIONS = (0.0, 0.5)
@@ -104,11 +103,17 @@ def after_impact(
 
 
 def follow_through(
-    problem: ConstrainedProblem, q: Array, velocity: Array, restitution: float, limits: ActuatorLimits
+    problem: ConstrainedProblem,
+    q: Array,
+    velocity: Array,
+    restitution: float,
+    limits: ActuatorLimits,
+    jobs: int = 1,
 ) -> FollowThrough:
     """Return the stop after the impact at ``q`` with the velocity ``ν``, shape (nv,), within the limits.
 
-    Held joints and feet are assumed not to move.  The velocity after the impact may exceed the limits.
+    Held joints and feet are assumed not to move.  The velocity after the impact may exceed the limits.  ``jobs``
+    processes compute the stops.
 
     A robot that falls (:func:`~impact_posture.posture.formulation.landing.falls_freely`) then stands on its
     contacts, and ``limits`` are the limits of the standing robot
@@ -128,47 +133,52 @@ def follow_through(
     impacts = {"the predicted impact": (spaces, 1.0, 0.0 if falls else restitution)} | {
         f"restitution {e:g}, {factor:.0%} of the speed{where}": (at, factor, e) for e, factor, (where, at) in spread
     }
-    predicted, rows, stops, hindrance = velocity, None, list[_Stop](), ""
-    for k, (name, (at, factor, e)) in enumerate(impacts.items()):
+    names, cases = list(impacts), list(impacts.values())
+
+    def stop_after(k: int) -> tuple[Array | None, _Stop | str]:
+        """Return the velocity after impact ``k``, and the stop or the reason why no stop exists."""
+        at, factor, e = cases[k]
         state = after_impact(problem, at, q, factor * velocity, e)
-        stop = "no impulse is known" if state is None else _stop(name, at, q, state, limits, falls)
-        predicted = state if k == 0 and state is not None else predicted
-        if isinstance(stop, str):
-            hindrance = hindrance or f"{stop}, after {name}"
-            continue
-        stops.append(stop)
-        if k == 0:
-            rows = sampled(spaces.rebound, stop.curve, limits, stop.law, "").rows
+        if state is None:
+            return state, "no impulse is known"
+        return state, _stop(names[k], at, q, state, limits, falls, sample=not k)
+
+    with fork_map(stop_after, len(cases), jobs) as results:
+        ends = [result for _, result in sorted(results, key=lambda pair: pair[0])]
+    state, first = ends[0]
+    stops = [stop for _, stop in ends if isinstance(stop, _Stop)]
+    missed = (f"{stop}, after {name}" for name, (_, stop) in zip(names, ends, strict=True) if isinstance(stop, str))
+    rows = (
+        None if isinstance(first, str) or first.rows is None else RowInterpolation(spaces.rebound.model, *first.rows)
+    )
     return FollowThrough(
-        velocity=predicted,
+        velocity=velocity if state is None else state,
         rows=rows,
         impacts=len(impacts),
         stopped=len(stops),
         longest_s=max((stop.duration for stop in stops), default=0.0),
         joints=_least(stops, lambda moment: _to_limits(spaces.rebound, moment[0])),
         clearance=_least(stops, lambda moment: _to_bodies(spaces.rebound, moment[0])),
-        hindrance=hindrance,
+        hindrance=next(missed, ""),
         center_of_pressure=_least(stops, _to_edges(standing, q, limits)),
     )
 
 
 @dataclass(frozen=True, eq=False)
 class _Stop:
-    """A stop after the impact with the name ``impact``; ``duration`` is its shortest duration before rounding, s."""
+    """A stop after the impact with the name ``impact``; ``duration`` is its shortest duration before rounding, s.
+
+    ``moments`` are evenly spaced in time.  ``rows`` are ``t, q, v, a`` of :class:`RowInterpolation`, if requested.
+    """
 
     impact: str
-    curve: PathCurve
-    law: TimeLaw
     duration: float
-
-    @property
-    def moments(self) -> Iterator[Moment]:
-        times = np.linspace(0.0, self.law.duration, _POSTURES)
-        return (moment(self.curve, self.law, float(t)) for t in times)
+    moments: list[Moment]
+    rows: tuple[Array, Array, Array, Array] | None
 
 
 def _stop(
-    impact: str, spaces: StrikeSpaces, q: Array, velocity: Array, limits: ActuatorLimits, falls: bool
+    impact: str, spaces: StrikeSpaces, q: Array, velocity: Array, limits: ActuatorLimits, falls: bool, sample: bool
 ) -> _Stop | str:
     """Return the shortest stop from a velocity, or the reason why no stop exists.
 
@@ -194,7 +204,10 @@ def _stop(
         return f"no stop along the velocity exists, because of {stroke.end}"
     if duration is None:
         return f"no stop along the velocity exists, because of {stroke.hindrance(limits, 1.0)}"
-    return _Stop(impact, stroke.curve, stroke.law(duration), duration)
+    law = stroke.law(duration)
+    moments = [moment(stroke.curve, law, t) for t in np.linspace(0.0, law.duration, _POSTURES).tolist()]
+    rows_ = sampled(space, stroke.curve, limits, law, "").rows if sample else None
+    return _Stop(impact, duration, moments, None if rows_ is None else (rows_.t, rows_.q, rows_.v, rows_.a))
 
 
 def _least(stops: Sequence[_Stop], distance: Callable[[Moment], tuple[float, str]]) -> Room | None:

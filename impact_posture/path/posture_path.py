@@ -117,6 +117,7 @@ def posture_path(
     effort: int = EFFORT,
     strike: float | None = None,
     restitution: float = 0.0,
+    jobs: int = 1,
 ) -> PosturePath:
     """Find a path from ``solution.initial`` to ``solution.q`` along which all constraints hold, and time it.
 
@@ -128,7 +129,7 @@ def posture_path(
     (:mod:`~impact_posture.path.strike`).  If no optimum allows a strike at this speed, the path ends at the optimum
     with the greatest speed.  If no optimum allows a strike at any speed, the path ends at rest.  ``restitution`` is
     the coefficient of the predicted impact, after which :mod:`~impact_posture.path.follow_through` stops the robot.
-    If nothing supports the robot, its path is a fall to the optimum.
+    If nothing supports the robot, its path is a fall to the optimum.  ``jobs`` processes compute the stops.
 
     Raises:
         InputError: The package of the extra ``path`` is not installed, or the contact cannot strike.
@@ -140,7 +141,7 @@ def posture_path(
         check_strike(problem, strike)
         if falls_freely(problem.objective, problem.requirements.base):
             limits = ActuatorLimits(landed(problem, start).objective, start, problem.requirements)
-        struck = _struck(solution, space, limits, strike, restitution, seed, effort)
+        struck = _struck(solution, space, limits, strike, restitution, seed, effort, jobs)
         if isinstance(struck, PosturePath):
             return struck
         no_strike = f"the path ends at rest, because {struck}"
@@ -213,6 +214,7 @@ def _struck(
     restitution: float,
     seed: int,
     effort: int,
+    jobs: int,
 ) -> PosturePath | str:
     """Return a path that strikes at an optimum with the stated or the greatest speed, or why no path strikes."""
     # The program requires the greatest possible speed if no posture allows the stated speed.
@@ -246,7 +248,7 @@ def _struck(
     if best is None:
         return failure or "no optimum allows a strike"
     k, run, method = best
-    after = follow_through(solution.problem, run.motion.rows.q[-1], run.strike.velocity, restitution, limits)
+    after = follow_through(solution.problem, run.motion.rows.q[-1], run.strike.velocity, restitution, limits, jobs)
     failure = f"{failure}; the path ends at optimum number {k + 1} of {len(solution.optima)}" if k else ""
     hindrance = run.strike.hindrance or (_EVERYWHERE if required < speed else "")
     strike = replace(run.strike, stated_speed=speed, hindrance=hindrance, follow_through=after)
