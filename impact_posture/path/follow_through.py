@@ -184,14 +184,17 @@ def _stop(
 
     Along the curve of the stop, the normal velocities of the contact points are proportional to its speed, so contact
     points move away from their surfaces.  If the robot falls, the velocity of its center of mass is constant instead,
-    so the ground need not pull the feet.  If feet slide after the impact, impulses at the feet first stop them.
+    so the ground need not pull the feet.  If its feet slide after the impact, impulses at the feet first stop them.
+    The velocity of a held joint is set to zero.
     """
     if falls and limits.missing:
         return f"no stop exists, because {limits.missing}"
     space = spaces.rebound
     numeric = Numeric(space.model).at(q)
-    held, factor = equality_jacobian(space.problem, numeric), np.linalg.cholesky(numeric.mass_matrix())
-    # With M = LLᵀ, the nearest velocity in the metric M that holds the constraints: ν − L⁻ᵀ(H L⁻ᵀ)⁺Hν.
+    held = equality_jacobian(space.problem, numeric)
+    # With W = LLᵀ, the nearest velocity in the metric W that holds the constraints is ν − L⁻ᵀ(H L⁻ᵀ)⁺Hν.  After a
+    # fall, W is the mass matrix.  Else, W is the identity, so that held joints do not change the other joints.
+    factor = np.linalg.cholesky(numeric.mass_matrix()) if falls else np.eye(space.model.nv)
     impulses = np.linalg.pinv(np.linalg.solve(factor, held.T).T, rcond=1e-9) @ (held @ velocity)
     velocity = velocity - np.linalg.solve(factor.T, impulses)
 

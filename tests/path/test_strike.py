@@ -21,7 +21,7 @@ from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.output.report.result_report import result_scene
 from impact_posture.output.result_reader import load_result
 from impact_posture.path.actuator_limits import ActuatorLimits
-from impact_posture.path.follow_through import _to_edges, after_impact, follow_through
+from impact_posture.path.follow_through import _stop, _to_edges, after_impact, follow_through
 from impact_posture.path.path_files import read_path, write_path
 from impact_posture.path.path_space import PathSpace
 from impact_posture.path.posture_path import PosturePath, posture_path
@@ -315,6 +315,17 @@ def test_the_stop_after_the_impact_starts_at_the_predicted_velocity(name: str) -
             assert (np.abs(pin.rnea(model, data, q, v, a)) <= model.effortLimit).all()
         for constraint in problem.constraints[: len(problem.objective.supports)]:
             assert np.abs(constraint.value(Numeric(model).at(q))).max() < 1e-5
+
+
+def test_a_held_gripper_does_not_change_the_velocity_of_the_arm() -> None:
+    problem = prepare(make_settings({"robot": "z1", "normal": (0, 0, 1), "contact_pose": "aligned"})).problem
+    q, spaces = problem.given, StrikeSpaces(problem, problem.given)
+    away = np.linalg.pinv(contact_of(problem, q)[1][:3]) @ [0.0, 0.0, 0.2]
+    held = np.isin(problem.robot.tangent_names, problem.requirements.hold)
+    limits = ActuatorLimits(problem.objective, q, problem.requirements)
+    stop = _stop("", spaces, q, np.where(held, 5.0, away), limits, False)
+    assert not isinstance(stop, str) and held.any()
+    np.testing.assert_allclose(next(stop.moments)[1], np.where(held, 0.0, away), atol=1e-6)
 
 
 @pytest.mark.parametrize(("effort", "cone"), [(8.0, 0.0), (8.0, 10.0), (5.0, 0.0)])
