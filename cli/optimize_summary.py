@@ -184,9 +184,10 @@ def _path(page: Page, path: dict[str, Any]) -> None:
         page.line("path: the start is the optimum" if path["found"] else "path: no path leads away from the start")
     if strike := path.get("strike"):
         falls = path["timing"] == FREE_FALL
+        begins = "that begins without a rest" if strike["rest_s"] < strike["run_up_s"] else "from rest"
         page.line(
             f"  strikes at {number(strike['speed'])} m/s, with {strike['share']:.0%} of the velocity limits, after a "
-            f"{'fall' if falls else 'run-up'} of {1e3 * strike['run_up_m']:.3g} mm from rest at "
+            f"{'fall' if falls else 'run-up'} of {1e3 * strike['run_up_m']:.3g} mm {begins} at "
             f"{strike['run_up_s']:.3g} s"
         )
         if strike["hindrance"]:

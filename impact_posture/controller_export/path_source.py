@@ -55,7 +55,9 @@ def render_path(s: Structure, reference: PathReference, prefix: str) -> dict[str
         raise InputError(fault, where="path", hint=hint)
     stop = strike and strike.follow_through and strike.follow_through.rows
     numbers = {
+        "rest": path.duration if strike is None else strike.rest_s,
         "run_up": path.duration if strike is None else strike.run_up_s,
+        "again": reference.again,
         "duration": path.duration,
         "stop": float(stop.t[-1]) if stop else 0.0,
         "speed": 0.0 if strike is None else strike.speed,

@@ -44,8 +44,9 @@ class PathCurve:
     because its velocity would jump where they become active.
 
     ``s`` contains the values of the parameter at the postures, evenly spaced, shape (n,).  ``z`` contains the tangent
-    coordinates of the postures at the first posture, shape (n, nv).  ``ends`` contains the velocity ``dq/ds`` at the
-    first and the last posture, shape (nv,) each; with ``None``, the spline chooses this velocity.
+    coordinates of the postures at the first posture, shape (n, nv).  The argument ``ends`` contains the velocity
+    ``dq/ds`` at the first and the last posture, shape (nv,) each; with ``None``, the spline chooses this velocity.
+    The attribute ``ends`` contains the same as boundary conditions of a ``CubicSpline`` in ``z``.
     """
 
     def __init__(
@@ -61,11 +62,11 @@ class PathCurve:
             if slot.kind.family == "continuous":
                 z[:, slot.v] = np.unwrap(z[:, slot.v], axis=0)
         self.z = z
-        self._ends = tuple(
+        self.ends = tuple(
             "not-a-knot" if v is None else (1, pin.dDifference(space.model, self._start, q, pin.ARG1) @ v)
             for v, q in zip(ends, (postures[0], postures[-1]), strict=True)
         )
-        self.spline = CubicSpline(self.s, z, bc_type=self._ends)
+        self.spline = CubicSpline(self.s, z, bc_type=self.ends)
 
     @property
     def corners(self) -> Array:
@@ -107,7 +108,7 @@ class PathCurve:
             row += self._space.difference(self._start, projector.project(q).q) - self._space.difference(
                 self._start, q
             )
-        return CubicSpline(s, z, bc_type=self._ends)
+        return CubicSpline(s, z, bc_type=self.ends)
 
     def deviation(self) -> float:
         """Return the largest tangent distance of the curve from the constraints; infinite if a posture is not valid.
@@ -129,11 +130,21 @@ class PathCurve:
         return worst
 
 
-def fitted_curve(space: PathSpace, postures: Sequence[Array]) -> PathCurve | None:
-    """Return a curve through a path, with enough knots to stay on the constraints; ``None`` if that fails."""
-    count = max(5, int(np.ceil(space.length(postures) / (2 * STEP))) + 1)
+def fitted_curve(
+    space: PathSpace,
+    postures: Sequence[Array],
+    sizes: Sequence[float] | None = None,
+    end: Array | None = None,
+    least: int = 5,
+) -> PathCurve | None:
+    """Return a curve through a path, with enough knots to stay on the constraints; ``None`` if that fails.
+
+    ``s`` is proportional to the sum of the ``sizes`` of the steps between postures (default: their tangent lengths).
+    ``end`` is the velocity ``dq/ds`` at the end, as in :class:`PathCurve`, and ``least`` the least number of knots.
+    """
+    count = max(least, int(np.ceil(space.length(postures) / (2 * STEP))) + 1)
     for _ in range(_DOUBLINGS + 1):
-        curve = PathCurve(space, even(space, postures, count))
+        curve = PathCurve(space, even(space, postures, count, sizes), (None, end))
         if curve.deviation() <= DEVIATION:
             return curve
         count = 2 * count - 1

@@ -31,7 +31,7 @@ _LARGEST = 1e9
 # Least time between two rows, s, because the times of rows have 9 decimals.
 _SHORTEST = 0.5 * 10.0**-DIGITS
 # Numbers of a strike in result.json.
-_STRIKE = ("speed", "stated_speed", "run_up_s", "run_up_m", "contact_s", "share")
+_STRIKE = ("speed", "stated_speed", "rest_s", "run_up_s", "run_up_m", "contact_s", "share")
 
 
 def write_path(folder: Path, robot: Robot, path: PosturePath) -> None:
@@ -114,9 +114,11 @@ def _read_rows(file: Path, robot: Robot) -> tuple[RowInterpolation, dict[str, Ar
 
 def _read_strike(folder: Path, block: Mapping[str, Any], path: RowInterpolation, robot: Robot) -> Strike:
     """Return the strike of a path from its block in ``result.json`` and ``follow_through.npz``."""
+    # Files of earlier versions have no ``rest_s``, because every run-up began at rest.
+    block = {"rest_s": block["run_up_s"], **block}
     numbers = np.array([block[key] for key in _STRIKE])
     known = numbers.dtype == float and np.isfinite(numbers).all() and (numbers >= 0).all() and block["speed"] > 0
-    if not known or not block["run_up_s"] < block["contact_s"] == path.t[-1]:
+    if not known or not block["rest_s"] <= block["run_up_s"] < block["contact_s"] == path.t[-1]:
         raise ValueError(f"speed and times of the strike do not fit the path of {robot.name}")
     after = {key: value for key, value in block["follow_through"].items() if key != "duration_s"}
     velocities = [np.array(part["velocity"], dtype=float) for part in (block, after)]

@@ -9,6 +9,7 @@ import pinocchio as pin
 
 from impact_posture.path.posture_path import PosturePath
 from impact_posture.path.row_interpolation import Moment, RowInterpolation
+from impact_posture.posture.approach.attainable_speed import RUN_UP
 from impact_posture.system.arrays import Array
 
 
@@ -18,7 +19,7 @@ class PathPhase(IntEnum):
     IDLE = 0
     """The path has not begun."""
     APPROACH = 1
-    """On the way to the beginning of the run-up, or waiting there; without a strike, on the way to the end."""
+    """On the way to the run-up, or waiting before it; without a strike, on the way to the end."""
     RUN_UP = 2
     LATE = 3
     """The contact is late: the references continue with the velocity of the impact."""
@@ -31,8 +32,10 @@ class PathPhase(IntEnum):
 class PathReference:
     """References of a controller along a path, which switch to the follow-through at the contact.
 
-    The run-up ends at the expected time of the contact.  Until the contact, the references continue with the
-    velocity of the impact for at most the time ``late``.  The contact is noticed at the first of three events:
+    The references wait where the path is last at rest: at the beginning of the run-up, or at the start if the path is
+    in one piece.  The run-up ends at the expected time of the contact.  Until the contact, the references continue
+    with the velocity of the impact for at most the time ``late``.  The contact is noticed in the run-up, at the first
+    of three events:
 
     1. A measured force exceeds ``felt``.
     2. Every contact point has less than the share ``stopped`` of its planned speed, both computed with the Jacobian
@@ -52,6 +55,7 @@ class PathReference:
         late: Longest time for which the references continue after the expected contact, s.
         felt: Force above which a contact is felt, N.
         stopped: The contact is noticed if every contact point has less than this share of its planned speed.
+        again: Time of the path at whose posture the references wait after :meth:`back`, s.
         lag: Time by which the accelerations are ahead of postures and velocities, s, because the thrust of rotors
             lags behind its command.
         phase: Phase at the last tick.
@@ -65,7 +69,9 @@ class PathReference:
         self.approach = np.zeros((1, path.model.nv)) if approach is None else np.atleast_2d(approach)
         self.late, self.felt, self.stopped = self.LATE, self.FELT, self.STOPPED
         strike = path.strike
-        self._run_up = path.duration if strike is None else strike.run_up_s
+        one_piece = strike is not None and strike.rest_s < strike.run_up_s
+        half, rest = max(path.duration - RUN_UP / 2, 0.0), path.duration if strike is None else strike.rest_s
+        self.again = half if one_piece else rest
         self._stop = None if strike is None or strike.follow_through is None else strike.follow_through.rows
         self._rest = np.zeros(path.model.nv)
         self.reset()
@@ -73,9 +79,15 @@ class PathReference:
     def reset(self) -> None:
         """Return to the beginning of the path, and wait there."""
         self.phase, self.moment = PathPhase.IDLE, (self.path.q[0], self._rest, self._rest)
-        # Motion to the beginning of the run-up, its first and last time, and the time when it begins.
+        strike, end = self.path.strike, self.path.duration
+        # Time of the path at which the references wait, and times from there and from the beginning of the run-up to
+        # the contact.
+        self._wait = end if strike is None else strike.rest_s
+        self._ahead, self._run_up = end - self._wait, end - (strike.run_up_s if strike else end)
+        self._slower = False
+        # Motion to the posture of waiting, its duration, and the time when it begins.
         self._way: RowInterpolation = self.path
-        self._until, self._begin, self._now = self._run_up, np.inf, -np.inf
+        self._until, self._begin, self._now = self._wait, np.inf, -np.inf
         # Time of the expected contact, time of the noticed contact, posture at the noticed contact, and share of the
         # planned velocity there.
         self._expected, self._hit, self._contact, self._share = np.inf, np.inf, self.path.q[-1], 1.0
@@ -89,19 +101,23 @@ class PathReference:
     def expect(self, contact: float) -> None:
         """Make the run-up end at time ``contact``, s, or as soon as possible after it.
 
-        ``-inf`` means as soon as possible, and ``inf`` means to wait at the beginning of the run-up.  The call has no
-        effect without a strike, before :meth:`start`, or after the beginning of the run-up.
+        ``-inf`` means as soon as possible, and ``inf`` means to wait.  The call has no effect without a strike,
+        before :meth:`start`, or after the end of the wait.
         """
-        if self.path.strike is not None and self.phase <= PathPhase.APPROACH and self._begin < np.inf:
-            self._expected = max(contact, max(self._begin + self._until, self._now) + self._duration)
+        if self.path.strike is not None and self._begin < np.inf and not self._strikes(self._now):
+            self._expected = max(contact, max(self._begin + self._until, self._now) + self._ahead)
 
     def back(self, over: float) -> None:
-        """Return to the beginning of the run-up within ``over`` seconds, and wait there for a call of :meth:`expect`.
+        """Return to the posture at the time ``again`` of the path within ``over`` seconds; wait for :meth:`expect`.
 
-        Before the contact, the call has no effect.
+        From there, the next run-up begins at rest.  On a path in one piece, it takes :data:`RUN_UP` for the last half
+        of this time.  Before the contact, the call has no effect.
         """
         if self._hit < np.inf:
-            ends, rest = np.array([self.moment[0], self.path.at(self._run_up)[0]]), np.zeros((2, len(self._rest)))
+            if self.again > self._wait:
+                self._wait, self._slower = self.again, True
+                self._ahead = self._run_up = 2 * (self.path.duration - self.again)
+            ends, rest = np.array([self.moment[0], self.path.at(self._wait)[0]]), np.zeros((2, len(self._rest)))
             self._way = RowInterpolation(self.path.model, np.array([0.0, over]), ends, rest, rest)
             self._until, self._begin, self._hit, self._expected = over, self._now, np.inf, np.inf
             self.phase = PathPhase.APPROACH
@@ -119,7 +135,7 @@ class PathReference:
         if self._strikes(t) and self._hit == np.inf:
             planned, speed, _ = self._at(t)
             late = t > self._expected + self.late
-            if late or self._touches(speed, v, force):
+            if late or (self.phase != PathPhase.APPROACH and self._touches(speed, v, force)):
                 self._hit, self._contact = t, q if late else planned
                 # The velocity after an impact is proportional to the velocity before.
                 whole = self.path.v[-1]
@@ -137,16 +153,24 @@ class PathReference:
         # At the beginning of the run-up, the planned speed is too small for a comparison.
         return speed < self.stopped * wanted > self.stopped**2 * self.path.strike.speed
 
-    @property
-    def _duration(self) -> float:
-        return self.path.duration - self._run_up
-
     def _strikes(self, t: float) -> bool:
-        return t >= self._expected - self._duration
+        return t >= self._expected - self._ahead
+
+    def _before(self, late: float) -> Moment:
+        """Return the references at the time ``late ≤ 0`` after the expected contact.
+
+        After a return on a path in one piece, the pace along the path rises from 0 to 1 as ``3τ² − 2τ³``.
+        """
+        if not self._slower:
+            return self.path.at(self.path.duration + late)
+        x = 1 + late / self._ahead
+        pace, rise = x**2 * (3 - 2 * x), 6 * x * (1 - x) / self._ahead
+        q, v, a = self.path.at(self._wait + x**3 * (1 - x / 2) * self._ahead)
+        return q, v * pace, a * pace**2 + v * rise
 
     def _at(self, t: float) -> Moment:
         """Set the phase and return the references at time ``t``."""
-        model, rest, end = self.path.model, self._rest, self.path.duration
+        model, rest = self.path.model, self._rest
         if self._begin == np.inf:
             return self.moment
         if not self._strikes(t):
@@ -156,8 +180,9 @@ class PathReference:
             return (q, rest, rest) if done else (q, v, a)
         if self._hit == np.inf:
             late = t - self._expected
-            self.phase = PathPhase.RUN_UP if late <= 0 else PathPhase.LATE
-            q, v, a = self.path.at(min(end + late, end))
+            near = t >= self._expected - self._run_up
+            self.phase = PathPhase.LATE if late > 0 else PathPhase.RUN_UP if near else PathPhase.APPROACH
+            q, v, a = self._before(min(late, 0.0))
             return (q, v, a) if late <= 0 else (np.array(pin.integrate(model, q, late * v)), v, rest)
         q, v, a = (self.path.q[-1], rest, rest) if self._stop is None else self._stop.at(t - self._hit)
         done = self._stop is None or t - self._hit >= self._stop.t[-1]
@@ -171,5 +196,5 @@ class PathReference:
         """Elapsed share of the path to the contact, 0 to 1."""
         if self.phase in (PathPhase.IDLE, PathPhase.APPROACH):
             elapsed = min(max(self._now - self._begin, 0.0) / self._until, 1.0) if self._until else 1.0
-            return 0.0 if self.phase == PathPhase.IDLE else elapsed * self._run_up / self.path.duration
+            return 0.0 if self.phase == PathPhase.IDLE else elapsed * self._wait / self.path.duration
         return 1.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -127,14 +127,27 @@ def shortened(space: PathSpace, postures: Sequence[Array], seed: int = 0) -> lis
     return band if space.length(band) < space.length(path) and space.clear_path(band) else path
 
 
-def even(space: PathSpace, postures: Sequence[Array], count: int) -> list[Array]:
-    """Return ``count`` postures on the constraints that divide a path evenly, including both ends."""
-    lengths = np.array([space.distance(a, b) for a, b in pairwise(postures)])
-    ends = np.concatenate([[0.0], np.cumsum(lengths)])
-    divided = [postures[0]]
-    for s in np.linspace(0.0, ends[-1], count)[1:-1]:
+def even(
+    space: PathSpace, postures: Sequence[Array], count: int, sizes: Sequence[float] | None = None
+) -> list[Array]:
+    """Return ``count`` postures on the constraints that divide a path evenly, including both ends.
+
+    ``sizes`` are the sizes of the steps between postures; the default is their tangent lengths.
+    """
+    whole = space.length(postures) if sizes is None else sum(sizes)
+    inside = placed(space, postures, np.linspace(0.0, whole, count)[1:-1], sizes)
+    return [postures[0], *inside, postures[-1]]
+
+
+def placed(
+    space: PathSpace, postures: Sequence[Array], places: Iterable[float], sizes: Sequence[float] | None = None
+) -> list[Array]:
+    """Return the postures on the constraints at sizes from the beginning of a path, as in :func:`even`."""
+    lengths = np.array([space.distance(a, b) for a, b in pairwise(postures)] if sizes is None else sizes)
+    ends, divided = np.concatenate([[0.0], np.cumsum(lengths)]), list[Array]()
+    for s in places:
         k = min(int(np.searchsorted(ends, s, side="right")) - 1, len(lengths) - 1)
         step = space.difference(postures[k], postures[k + 1])
         moved = space.pulled(postures[k], step * ((s - ends[k]) / lengths[k]))
         divided.append(postures[k] if moved is None else moved)
-    return [*divided, postures[-1]]
+    return divided

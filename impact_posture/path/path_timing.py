@@ -11,6 +11,7 @@ from impact_posture.path.actuator_limits import ActuatorLimits
 from impact_posture.path.path_curve import PathCurve
 from impact_posture.path.path_space import PathSpace
 from impact_posture.path.speed_profile import slowed
+from impact_posture.path.stroke import SHARE
 from impact_posture.path.time_law import polynomial, stepped
 from impact_posture.path.timed_curve import SAMPLE_TIME, TimedCurve, moment, sampled
 from impact_posture.system.arrays import Array
@@ -29,48 +30,82 @@ _ACTIVE = 0.98
 _ONE_AXIS = ("revolute", "continuous", "prismatic")
 # A time-optimal motion is rejected if it needs more than this multiple of any limit.
 _EXCEEDED = 1.01
+# A motion that does not end at rest keeps its speed along the curve for this time before its end, s.
+_STEADY = 5e-3
+# A controller permits no acceleration that would reach a velocity limit within the time ``1/RATE``, s
+# (:attr:`impact_posture.tsid.limits.acceleration_bounds.LimitLaw.rate`).
+RATE = 50.0
 # Coefficients of 6 τ⁵ − 15 τ⁴ + 10 τ³, highest power first.
 _SMOOTH = np.array([6.0, -15.0, 10.0, 0.0, 0.0, 0.0])
 
 
-def time_optimal(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedCurve | None:
+def time_optimal(
+    space: PathSpace, curve: PathCurve, limits: ActuatorLimits, place: float = np.inf, rate: float = 0.0
+) -> TimedCurve | None:
     """Return the fastest motion within velocity and torque limits (TOPP-RA, Pham and Pham 2018), or ``None``.
 
-    The robot must have a fixed base, joints of one degree of freedom, and known torque limits.
+    The robot must have a fixed base, joints of one degree of freedom, and known torque limits.  The function also
+    returns ``None`` if the motion exceeds limits between the points of its grid.
+
+    The motion ends with ``ṡ = rate``, and ``ṡ`` is at most ``rate`` from ``s = place`` on.  If ``rate`` is not zero,
+    the motion leaves a part of the torques to the controller (:data:`~impact_posture.path.stroke.SHARE`), and its
+    accelerations are within the bounds of the controller, ``|q̈_i| ≤ RATE (v̄_i − |q̇_i|)``.  TOPP-RA needs bounds that
+    are linear in ``q̈`` and ``q̇²``.  So the motion satisfies the stricter ``(q̇_i/v̄_i)² + 2|q̈_i|/(RATE v̄_i) ≤ 1``.
     """
     from toppra import SplineInterpolator
     from toppra.algorithm import TOPPRA
-    from toppra.constraint import DiscretizationType, JointTorqueConstraint, JointVelocityConstraint
+    from toppra.constraint import DiscretizationType, JointVelocityConstraintVarying, SecondOrderConstraint
+
+    if not topp_ra_times(space, limits):
+        return None
 
     speed = space.problem.robot.velocity_limits
     # The solver does not accept infinite limits.
     bound = np.where(np.isfinite(speed), speed, 1e6)
 
-    # TOPP-RA needs a torque for every joint, so the torque of a joint without a limit is set to zero.
-    count, limited = space.model.nv, len(limits.names)
-
     def used(z: Array, v: Array, a: Array) -> Array:
         q = curve.at(z)
         shares = limits.shares(q, limits.load(q, v, a))
         assert shares is not None  # noqa: S101 (a fixed base balances every load)
-        return np.concatenate([shares, np.zeros(count - limited)])
+        if not rate:
+            return shares
+        square, rise = (v / bound) ** 2, 2 * a / (RATE * bound)
+        return np.concatenate([shares / SHARE, square + rise, square - rise])
 
-    constraints = [
-        JointVelocityConstraint(np.column_stack([-bound, bound])),
-        JointTorqueConstraint(
-            used, np.tile([-1.0, 1.0], (count, 1)), np.zeros(count),
-            discretization_scheme=DiscretizationType.Interpolation,
-        ),
-    ]  # fmt: skip
     # The parameter is the path length, so that the derivative of the posture with respect to the parameter has
     # norm 1.  TOPP-RA loses digits if this norm is far from 1.
     size = space.length([curve.at(z) for z in curve.z])
-    places = np.linspace(0.0, 1.0, _GRID + 1)
-    planner = TOPPRA(constraints, SplineInterpolator(size * curve.s, curve.z), gridpoints=size * places)
-    rates = planner.compute_parameterization(0.0, 0.0)[1]
+    ends = tuple(end if isinstance(end, str) else (1, end[1] / size) for end in curve.ends)
+    spline = SplineInterpolator(size * curve.s, curve.z, bc_type=ends)
+
+    def speeds(x: float) -> Array:
+        # The largest share of a velocity limit at this rate.
+        share = size * rate * float((np.abs(spline(x, 1)) / bound).max())
+        arrives = x >= size * (place - 1 / _GRID)
+        return (min(share, 1.0) if arrives else 1.0) * np.column_stack([-bound, bound])
+
+    count = len(used(curve.z[0], *np.zeros((2, space.model.nv))))
+    sides = np.vstack([np.eye(count), -np.eye(count)])
+    constraints = [
+        JointVelocityConstraintVarying(speeds),
+        SecondOrderConstraint(
+            used, lambda _: sides, lambda _: np.ones(2 * count), space.model.nv,
+            discretization_scheme=DiscretizationType.Interpolation,
+        ),
+    ]  # fmt: skip
+    places = np.linspace(0.0, 1.0 - _STEADY * rate, _GRID + 1)
+    places = np.append(places, [1.0] if rate else [])
+    planner = TOPPRA(constraints, spline, gridpoints=size * places)
+    rates = planner.compute_parameterization(0.0, size * rate)[1]
     if rates is None or not np.isfinite(rates).all():
         return None
-    return sampled(space, curve, limits, stepped(places, rates / size), "time-optimal")
+    rates = rates / size
+    if rate:
+        if not np.allclose(rates[-2:], rate, rtol=1e-6):
+            return None
+        rates[-2:] = rate
+    motion = sampled(space, curve, limits, stepped(places, rates), "time-optimal")
+    return motion if _exceeded(space, motion, limits) <= _EXCEEDED else None
 
 
 def scaled(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedCurve:
@@ -128,15 +163,16 @@ def timed(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedCu
 
     If a time-optimal motion exceeds limits between the points of its grid, the slowed motion replaces it.
     """
+    motion = time_optimal(space, curve, limits)
+    if motion is None and topp_ra_times(space, limits):
+        motion = slowed(space, curve, limits)
+    return scaled(space, curve, limits) if motion is None else motion
+
+
+def topp_ra_times(space: PathSpace, limits: ActuatorLimits) -> bool:
+    """Return whether TOPP-RA can time the robot: fixed base, joints of one axis, and known torque limits."""
     axes = all(slot.kind.family in _ONE_AXIS for slot in space.projector.chart.slots)
-    if not limits.missing and axes and not space.problem.robot.floating:
-        fastest = time_optimal(space, curve, limits)
-        if fastest is not None and _exceeded(space, fastest, limits) <= _EXCEEDED:
-            return fastest
-        slower = slowed(space, curve, limits)
-        if slower is not None:
-            return slower
-    return scaled(space, curve, limits)
+    return not limits.missing and axes and not space.problem.robot.floating
 
 
 def _exceeded(space: PathSpace, motion: TimedCurve, limits: ActuatorLimits) -> float:

@@ -10,11 +10,12 @@ import numpy as np
 
 from impact_posture.errors import InputError
 from impact_posture.path.actuator_limits import ActuatorLimits
+from impact_posture.path.blend import blended_curve
 from impact_posture.path.follow_through import follow_through
 from impact_posture.path.path_curve import fitted_curve
 from impact_posture.path.path_search import EFFORT, Connection, connect, shortened
 from impact_posture.path.path_space import PathSpace
-from impact_posture.path.path_timing import LimitUse, limit_use, timed
+from impact_posture.path.path_timing import LimitUse, limit_use, time_optimal, timed, topp_ra_times
 from impact_posture.path.reachable_curve import ReachableCurve
 from impact_posture.path.row_interpolation import INTERPOLATION, RowInterpolation
 from impact_posture.path.strike import FREE_FALL, RunUp, Strike, check_strike, run_up
@@ -39,6 +40,8 @@ _FASTER = 1.02
 _NO_MOTION = 1e-6
 # A relative reduction of the objective below this value is treated as no reduction.
 _NO_GAIN = 1e-6
+# Number of postures of a run-up from which a blended curve is computed.
+_POSTURES = 65
 # Largest number of reached postures to evaluate if no optimum is reached.
 _MOST_VISITED = 400
 
@@ -272,12 +275,35 @@ def _led(start: Array, run: RunUp, limits: ActuatorLimits, seed: int, effort: in
         notes = (f"the path begins {moved:.2g} (rad, m) from the start, {at}", *notes)
     if space.length(connection.path) <= _NO_MOTION:
         return replace(run, motion=replace(motion, notes=notes)), connection.method
+    if (whole := _in_one_piece(run, shortened(space, connection.path, seed), limits, notes)) is not None:
+        return whole, connection.method
     there = _timed(space, connection.path, limits, seed)
     if there is None:
         return _NOT_SMOOTH
     motion = TimedCurve(there.rows.followed_by(motion.rows), there.method, (*there.notes, *notes))
-    strike = replace(run.strike, run_up_s=float(there.rows.t[-1]), contact_s=float(motion.rows.t[-1]))
+    rest, end = float(there.rows.t[-1]), float(motion.rows.t[-1])
+    strike = replace(run.strike, rest_s=rest, run_up_s=rest, contact_s=end)
     return replace(run, motion=motion, strike=strike), connection.method
+
+
+def _in_one_piece(run: RunUp, way: list[Array], limits: ActuatorLimits, notes: tuple[str, ...]) -> RunUp | None:
+    """Return the run-up after a way without a rest between them; ``None`` if no time-optimal motion is possible."""
+    space, (law, rows), strike = run.spaces.approach, (run.motion.law, run.motion.rows), run.strike
+    if law is None or not topp_ra_times(space, limits):
+        return None
+    evenly = np.linspace(law.at(np.zeros(1))[0][0], 1.0, _POSTURES)
+    postures = [rows.q[0], *(rows.at(law.when(s))[0] for s in evenly[1:-1]), rows.q[-1]]
+    step = strike.velocity * (strike.run_up_m / strike.speed / (_POSTURES - 1))
+    if (blended := blended_curve(space, way, postures, step)) is None:
+        return None
+    curve, place = blended
+    rate = float(np.linalg.norm(strike.velocity) / np.linalg.norm(curve.moment(1.0)[1]))
+    motion = time_optimal(space, curve, limits, place, rate)
+    if motion is None or motion.law is None:
+        return None
+    begin, end, length = motion.law.when(place), float(motion.rows.t[-1]), strike.speed * (1 - place) / rate
+    strike = replace(strike, run_up_s=begin, run_up_m=length, contact_s=end, velocity=motion.rows.v[-1])
+    return replace(run, motion=replace(motion, notes=notes), strike=strike)
 
 
 def _still(space: PathSpace, q: Array, *reasons: str) -> PosturePath:

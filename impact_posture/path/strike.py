@@ -55,7 +55,8 @@ class Strike(JsonBlock):
     Attributes:
         speed: Speed at which the contact point arrives at the surface, m/s.
         stated_speed: Stated speed, m/s.
-        run_up_s: Time at which the run-up or the fall begins, s.  The robot is then at rest.
+        rest_s: Time at which the robot is last at rest before the contact, s.  A controller waits there.
+        run_up_s: Time at which the run-up or the fall begins, s.  The run-up is along the normal.
         run_up_m: Length of the run-up along the normal, or height of the fall, m.
         contact_s: Time of the contact, s.
         velocity: Generalized velocity at the contact, shape (nv,).
@@ -66,6 +67,7 @@ class Strike(JsonBlock):
 
     speed: float
     stated_speed: float
+    rest_s: float
     run_up_s: float
     run_up_m: float
     contact_s: float
@@ -236,7 +238,14 @@ def _fall(problem: ConstrainedProblem, q: Array, speed: float) -> RunUp | str:
         return f"the fall violates: {', '.join(blocked)}"
     rows, height = RowInterpolation(model, t, postures, np.outer(t, a), np.tile(a, (len(t), 1))), speed * end / 2
     strike = Strike(
-        speed=speed, stated_speed=speed, run_up_s=0.0, run_up_m=height, contact_s=end, velocity=rows.v[-1], share=0.0
+        speed=speed,
+        stated_speed=speed,
+        rest_s=0.0,
+        run_up_s=0.0,
+        run_up_m=height,
+        contact_s=end,
+        velocity=rows.v[-1],
+        share=0.0,
     )
     return RunUp(TimedCurve(rows, FREE_FALL), strike, spaces)
 
@@ -268,7 +277,7 @@ def _timed_run_up(
     motion = sampled(space, stroke.curve, limits, stroke.law(duration, low), "scaled", notes)
     reached, end = low * speed, float(motion.rows.t[-1])
     strike = Strike(
-        speed=reached, stated_speed=speed, run_up_s=0.0, run_up_m=reached * end / 2, contact_s=end,
+        speed=reached, stated_speed=speed, rest_s=0.0, run_up_s=0.0, run_up_m=reached * end / 2, contact_s=end,
         velocity=motion.rows.v[-1], share=low * share, hindrance=hindrance,
     )  # fmt: skip
     return RunUp(motion, strike, spaces)

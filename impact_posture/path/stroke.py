@@ -45,7 +45,7 @@ _BISECTIONS = 5
 # Number of instants at which a stroke is checked.
 _INSTANTS = 25
 # A stroke uses at most this share of the range of torques and thrusts.  The rest is left to the controller.
-_SHARE = 0.95
+SHARE = 0.95
 _SINGULAR, _BENT = "a posture that is nearly singular", "a sharp bend of the constraints"
 # Progress over τ = t/T, highest power first: the speed rises as 3τ² − 2τ³ to its end value, or falls from it.
 _RISING, _FALLING = np.array([-1.0, 2.0, 0.0, 0.0, 0.0]), np.array([1.0, -2.0, 0.0, 2.0, 0.0])
@@ -136,7 +136,7 @@ class Stroke:
         law, worst = self.law(duration, factor), Need(0.0, "")
         allowed = np.maximum(self._space.problem.robot.velocity_limits, factor * np.abs(self._u) * (1 + 1e-9))
         for t in np.linspace(0.0, law.duration, _INSTANTS):
-            needed = limits.need(moment(self.curve, law, float(t)), allowed, _SHARE)
+            needed = limits.need(moment(self.curve, law, float(t)), allowed, SHARE)
             worst = max(worst, needed, key=lambda need: need.share)
             if stop and worst.share > 1:
                 break

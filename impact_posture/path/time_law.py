@@ -41,6 +41,10 @@ class TimeLaw:
         s, ds, dds = (self.progress(t, order) for order in range(3))
         return s, ds, dds
 
+    def when(self, s: float) -> float:
+        """Return the first time at which the progress is ``s``, s."""
+        return float(self.progress.solve(s, extrapolate=False)[0])
+
 
 def polynomial(coefficients: Array, duration: float) -> TimeLaw:
     """Return the law whose ``s`` is a polynomial of ``t/T``, with ``coefficients`` from the highest power on."""
@@ -52,17 +56,21 @@ def polynomial(coefficients: Array, duration: float) -> TimeLaw:
 
 
 def stepped(s: Array, rates: Array) -> TimeLaw:
-    """Return the law with the speeds ``ṡ`` at places ``s``, both of shape (n,), from rest to rest.
+    """Return the law with the speeds ``ṡ`` at places ``s``, both of shape (n,), from rest.
 
     Between two places, ``s̈`` is constant.  At the places, ``s̈`` would jump, and an interpolation of rows would
     overshoot.  So ``s`` is averaged over :data:`RAMP`, and ``s̈`` changes linearly.  An average of speeds and
-    accelerations exceeds no limit, because the limits are convex and hardly change in this time.
+    accelerations exceeds no limit, because the limits are convex and hardly change in this time.  If the motion does
+    not end at rest, ``ṡ`` must be constant before its end, and the end value of ``ṡ`` is exact.
     """
     from scipy.interpolate import PPoly
 
     ends = np.append(0.0, np.cumsum(2 * np.diff(s) / (rates[1:] + rates[:-1])))
-    duration = whole(float(ends[-1]) + min(RAMP, _SHARE * float(ends[-1])))
-    ramp = duration - float(ends[-1])
+    # A motion that does not end at rest would continue beyond the last place, which the average passes half a ramp
+    # later.
+    part = 2 if rates[-1] else 1
+    duration = whole(float(ends[-1]) + min(RAMP, _SHARE * float(ends[-1])) / part)
+    ramp = part * (duration - float(ends[-1]))
     t = np.unique([*ends, *(ends + ramp)])
     dds = (np.interp(t, ends, rates) - np.interp(t - ramp, ends, rates)) / ramp
     progress = PPoly(np.array([np.diff(dds) / np.diff(t), dds[:-1]]), t).antiderivative(2)

@@ -41,11 +41,13 @@ class TimedCurve:
         method: ``time-optimal`` (fixed base), ``scaled`` (one time scale for the whole motion), ``slowed`` (slower
             at corners of the curve) or ``free fall``.
         notes: Limits that the motion does not respect, and why.
+        law: Progress along the curve; ``None`` if the motion follows several curves.
     """
 
     rows: RowInterpolation
     method: str
     notes: tuple[str, ...] = ()
+    law: TimeLaw | None = None
 
     @property
     def instants(self) -> Array:
@@ -90,7 +92,7 @@ def sampled(
         yield from rows(middle, end, cuts - 1)
 
     pieces = [rows(start, end, _CUTS) for start, end in pairwise(zip(t.tolist(), first, strict=True))]
-    return TimedCurve(_joined(space, [*chain(*pieces), (t[-1], first[-1])]), method, notes)
+    return TimedCurve(_joined(space, [*chain(*pieces), (t[-1], first[-1])]), method, notes, law)
 
 
 def _joined(space: PathSpace, rows: Sequence[Row]) -> RowInterpolation:

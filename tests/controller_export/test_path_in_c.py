@@ -29,8 +29,8 @@ PERIOD = 1e-3
 
 
 @cache
-def library_of(name: str, strikes: bool = True) -> ctypes.CDLL:
-    folder = write_references(Path(KEPT.name) / f"{name}-{strikes}", name, strikes)
+def library_of(name: str, strikes: bool, rest: float) -> ctypes.CDLL:
+    folder = write_references(Path(KEPT.name) / f"{name}-{strikes}-{rest}", name, strikes, rest=rest)
     command = [*need_compiler(), "-std=c99", *STRICT, "-Wconversion", "-O1", "-shared", "-fPIC", "ctl_path.c"]
     subprocess.run([*command, "-o", "path.so", "-lm"], cwd=folder, check=True)
     return ctypes.CDLL(str(folder / "path.so"))
@@ -39,13 +39,13 @@ def library_of(name: str, strikes: bool = True) -> ctypes.CDLL:
 class PathInC:
     """References of a robot in C, with the methods of ``PathReference``."""
 
-    def __init__(self, name: str, strikes: bool = True) -> None:
+    def __init__(self, name: str, strikes: bool = True, rest: float = 0.25) -> None:
         robot, doubles = formulation_of(name)[0], ctypes.c_double
         sizes = {"q": robot.nq, "v": robot.nv, "a": robot.nv, "late": 1, "felt": 1, "stopped": 1, "lag": 1}
         memory = {"phase": ctypes.c_int, "memory": doubles * (5 * robot.nv + 2 * robot.nq + 9)}
         fields = [*((key, doubles * size) for key, size in sizes.items()), *memory.items()]
         self.block = type("Path", (ctypes.Structure,), {"_fields_": fields})()
-        self._library = library_of(name, strikes)
+        self._library = library_of(name, strikes, rest)
         self._call("init")
 
     def _call(self, name: str, *arguments: Any) -> int:
@@ -77,13 +77,14 @@ def phases(
     stopped: float = 0.0,
     n: int = 700,
     strikes: bool = True,
+    rest: float = 0.25,
 ) -> dict[int, PathPhase]:
     """Make the same calls in Python and in C at the same ticks, and compare the references of all ticks.
 
     The robot is not at its reference, and has 30 % of the velocity of the reference.  Return the ticks at which a
     phase begins.
     """
-    python, c, begun = reference_of(name, strikes), PathInC(name, strikes), dict[int, PathPhase]()
+    python, c, begun = reference_of(name, strikes, rest=rest), PathInC(name, strikes, rest), dict[int, PathPhase]()
     python.reset()
     python.stopped = c.block.stopped[0] = stopped
     model, rng, before = python.path.model, np.random.default_rng(1), PathPhase.IDLE
@@ -139,6 +140,22 @@ def test_a_strike_waits_and_is_repeated(name: str) -> None:
     first = {0: PathPhase.APPROACH, 350: PathPhase.RUN_UP, 480: PathPhase.FOLLOW_THROUGH, 680: PathPhase.HOLD}
     # The return begins at the last tick, so it ends after 0.819 s.
     assert begun == first | {720: PathPhase.APPROACH, 819: PathPhase.RUN_UP}
+
+
+@pytest.mark.parametrize("name", ["panda", "solo8"])
+def test_a_strike_in_one_piece_waits_at_the_start_and_is_repeated_from_rest(name: str) -> None:
+    calls: dict[int, Call] = {
+        0: lambda path: path.start(0.0, np.inf),
+        100: lambda path: path.expect(0.6),
+        # The motion has begun, so the expected contact cannot change.
+        300: lambda path: path.expect(0.9),
+        820: lambda path: path.back(0.1),
+        850: lambda path: path.expect(1.05),
+    }
+    # A force before the run-up is not the contact.
+    begun = phases(name, calls, {300: 60.0, 580: 60.0}, n=1100, rest=0.0)
+    first = {0: PathPhase.APPROACH, 450: PathPhase.RUN_UP, 580: PathPhase.FOLLOW_THROUGH, 780: PathPhase.HOLD}
+    assert begun == first | {820: PathPhase.APPROACH, 950: PathPhase.RUN_UP, 1051: PathPhase.LATE}
 
 
 def test_a_path_without_strike_ends_at_rest() -> None:

@@ -109,7 +109,7 @@ def test_all_controllers_share_gains_tasks_and_weights(monkeypatch: pytest.Monke
             factory.setup.robot.model, np.array([0.0, 1.0]), np.tile(factory.setup.q, (2, 1)), rest, rest
         )
         monkeypatch.setitem(vars(factory), "path", SimpleNamespace(strike=None, duration=0.0, at=still.at))
-        strike = SimpleNamespace(follow_through=None, run_up_s=0.0, contact_s=0.0)
+        strike = SimpleNamespace(follow_through=None, rest_s=0.0, run_up_s=0.0, contact_s=0.0)
         struck = SimpleNamespace(strike=strike, duration=0.0, at=still.at, **vars(still))
         monkeypatch.setitem(vars(factory), "strike", struck)
         nominal = factory.driver("nominal").controller.formulation

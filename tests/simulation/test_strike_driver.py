@@ -151,7 +151,7 @@ def test_accelerations_of_a_robot_with_rotors_are_ahead_by_the_lag_of_its_thrust
     travel = np.polynomial.Polynomial([0.0, 0.0, 0.0, -0.5 / 0.2**2, 0.5 / 2 / 0.2**3])
     rows = [[float(p(t)) * down for t in times] for p in (travel, travel.deriv(), travel.deriv(2))]
     postures = np.array([pin.integrate(model, setup.q, step) for step in rows[0]])
-    strike = Strike(0.5, 0.5, 0.0, 0.05, 0.2, rows[1][-1], 0.0)
+    strike = Strike(0.5, 0.5, 0.0, 0.0, 0.05, 0.2, rows[1][-1], 0.0)
     path = PosturePath(
         model, times, postures, np.array(rows[1]), np.array(rows[2]), found=True, reason="", method="", timing="",
         objective=0.0, length=0.05, max_violation=0.0, strike=strike,

@@ -71,9 +71,39 @@ static void ip_path_rest(ip_path *p)
   memset(p->a, 0, sizeof p->a);
 }
 
+/* Return whether the next run-up follows the end of the path from rest, because the path has no rest there. */
+static int ip_path_slower(const ip_path *p)
+{
+  return p->returns && IP_PATH_AGAIN_S > IP_PATH_REST_S;
+}
+
+/* Return the time from the end of the wait to the contact. */
+static double ip_path_ahead(const ip_path *p)
+{
+  return ip_path_slower(p) ? 2.0 * (IP_PATH_DURATION_S - IP_PATH_AGAIN_S) : IP_PATH_DURATION_S - IP_PATH_REST_S;
+}
+
 static int ip_path_strikes(const ip_path *p, double t)
 {
-  return t >= p->expected - (IP_PATH_DURATION_S - IP_PATH_RUN_UP_S);
+  return t >= p->expected - ip_path_ahead(p);
+}
+
+/* Write the reference at the time late <= 0 after the expected contact. */
+static void ip_path_before(ip_path *p, double late)
+{
+  if (ip_path_slower(p)) {
+    const double ahead = ip_path_ahead(p), x = 1.0 + late / ahead;
+    const double pace = x * x * (3.0 - 2.0 * x), rise = 6.0 * x * (1.0 - x) / ahead;
+    int i;
+    ip_path_follow(p, ip_path_rows, IP_PATH_SEGMENTS, IP_PATH_DURATION_S,
+                   IP_PATH_AGAIN_S + x * x * x * (1.0 - x / 2.0) * ahead);
+    for (i = 0; i < IP_NV; ++i) {
+      p->a[i] = p->a[i] * pace * pace + p->v[i] * rise;
+      p->v[i] *= pace;
+    }
+  } else {
+    ip_path_follow(p, ip_path_rows, IP_PATH_SEGMENTS, IP_PATH_DURATION_S, IP_PATH_DURATION_S + late);
+  }
 }
 
 /* Set the phase, and write the reference at the time t. */
@@ -93,8 +123,9 @@ static void ip_path_at(ip_path *p, double t)
     }
   } else if (p->hit == INFINITY) {
     const double late = fmin(t - p->expected, p->late);
-    p->phase = late <= 0.0 ? IP_PATH_RUN_UP : IP_PATH_LATE;
-    ip_path_follow(p, ip_path_rows, IP_PATH_SEGMENTS, IP_PATH_DURATION_S, IP_PATH_DURATION_S + fmin(late, 0.0));
+    const double run_up = ip_path_slower(p) ? ip_path_ahead(p) : IP_PATH_DURATION_S - IP_PATH_RUN_UP_S;
+    p->phase = late > 0.0 ? IP_PATH_LATE : t >= p->expected - run_up ? IP_PATH_RUN_UP : IP_PATH_APPROACH;
+    ip_path_before(p, fmin(late, 0.0));
     if (late > 0.0) {
       double q[IP_NQ];
       memcpy(q, p->q, sizeof q);
@@ -164,7 +195,7 @@ int ip_path_start(ip_path *p, double t, double contact)
   }
   p->phase = IP_PATH_APPROACH;
   p->returns = 0;
-  p->until = IP_PATH_RUN_UP_S;
+  p->until = IP_PATH_REST_S;
   p->begin = p->now = t;
   p->expected = p->hit = INFINITY;
   return IP_PATH_STRIKES ? ip_path_expect(p, contact) : 0;
@@ -172,10 +203,10 @@ int ip_path_start(ip_path *p, double t, double contact)
 
 int ip_path_expect(ip_path *p, double contact)
 {
-  if (!IP_PATH_STRIKES || isnan(contact) || p->phase != IP_PATH_APPROACH) {
+  if (!IP_PATH_STRIKES || isnan(contact) || p->phase != IP_PATH_APPROACH || ip_path_strikes(p, p->now)) {
     return 1;
   }
-  p->expected = fmax(contact, fmax(p->begin + p->until, p->now) + (IP_PATH_DURATION_S - IP_PATH_RUN_UP_S));
+  p->expected = fmax(contact, fmax(p->begin + p->until, p->now) + ip_path_ahead(p));
   return 0;
 }
 
@@ -188,7 +219,7 @@ int ip_path_return(ip_path *p, double over)
     return 1;
   }
   memcpy(p->from, p->q, sizeof p->from);
-  ip_path_follow(p, ip_path_rows, IP_PATH_SEGMENTS, IP_PATH_DURATION_S, IP_PATH_RUN_UP_S);
+  ip_path_follow(p, ip_path_rows, IP_PATH_SEGMENTS, IP_PATH_DURATION_S, IP_PATH_AGAIN_S);
   memcpy(here, p->q, sizeof here);
   memcpy(p->q, p->from, sizeof p->q);
   ip_path_rest(p);
@@ -215,7 +246,7 @@ int ip_path_tick(ip_path *p, double t, const double q[IP_NQ], const double *v, d
     ip_path_at(p, t);
     /* The test is not ">", because ">" is false for NaN. */
     const int late = !(t <= p->expected + p->late);
-    if (late || ip_path_touches(p, v, force)) {
+    if (late || (p->phase != IP_PATH_APPROACH && ip_path_touches(p, v, force))) {
       /* The velocity after an impact is proportional to the velocity before. */
       const double share = ip_dot(p->v, ip_path_velocity, IP_NV) / ip_dot(ip_path_velocity, ip_path_velocity, IP_NV);
       p->hit = t;

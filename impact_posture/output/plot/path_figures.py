@@ -225,6 +225,8 @@ def motion_figure(view: ResultView) -> Figure:
     use = required(motion.use, "motion", "path", "run optimize again with `path`")
     notes = [_NOTES.get(motion.timing, "")]
     notes += [f"Note: {motion.reason}."] if motion.reason else []
+    if motion.strike is not None and motion.strike.rest_s < motion.strike.run_up_s:
+        notes += ["Not shown: the limits of the controller on accelerations, which this motion also keeps."]
     notes += ["Dotted lines: start of the run-up or of the fall, and contact."] if motion.strike else []
     with framed(*header_lines(view), 6.2, notes) as (figure, body):
         joints, objective, shares = body.subplots(3, 1, sharex=True, height_ratios=[1.4, 1, 1])

@@ -21,10 +21,10 @@ from impact_posture.tsid.tasks.joint_posture import JointPosture
 class StrikeDriver(Driver):
     """Nominal controller whose references follow a path that strikes (:mod:`impact_posture.path.strike`).
 
-    After :meth:`brace`, the robot moves to the beginning of the run-up.  The run-up ends at the expected time of the
-    impact.  At the contact, which :class:`~impact_posture.path.path_reference.PathReference` notices, the references
-    switch to the stop after the impact.  When the end effector has to return, the robot moves back to the beginning
-    of the run-up.
+    After :meth:`brace`, the robot moves to the beginning of the run-up, or waits at the start if the path is in one
+    piece.  The run-up ends at the expected time of the impact.  At the contact, which
+    :class:`~impact_posture.path.path_reference.PathReference` notices, the references switch to the stop after the
+    impact.  When the end effector has to return, the robot moves back to a posture of the path before the contact.
 
     The thrust of rotors lags behind the command.  For a robot with rotors, the acceleration references are therefore
     ahead of the other references by the mean time constant of the rotors.
@@ -60,8 +60,8 @@ class StrikeDriver(Driver):
 
     @property
     def ahead(self) -> float:
-        run_up = self.path.duration - (self.path.strike.run_up_s if self.path.strike else 0.0)
-        return run_up + self.setup.scenario.control.period
+        rest = self.path.strike.rest_s if self.path.strike else 0.0
+        return self.path.duration - rest + self.setup.scenario.control.period
 
     def tick(self, reading: Reading, reference: ReferencePoint | None = None) -> Command:
         if reference is not None and reference.speed < 0:
