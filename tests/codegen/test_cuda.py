@@ -50,7 +50,7 @@ WORDS = """
 #define THREADS 128
 static thread_local struct { size_t x; } blockIdx, threadIdx, gridDim;
 static std::barrier<> barrier(THREADS);
-#define BARRIER() barrier.arrive_and_wait()
+#define GPU_BARRIER() barrier.arrive_and_wait()
 template <typename Kernel> void run(size_t blocks, size_t threads, Kernel kernel)
 {
   for (size_t block = 0; block < blocks; ++block) {
