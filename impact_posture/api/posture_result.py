@@ -177,7 +177,7 @@ class PostureResult:
             seed: Seed of the sampling planner.
             strike: Whether the path ends with an impact instead of at rest (:mod:`~impact_posture.path.strike`).  The
                 contact point then arrives with the approach speed of the problem, after a run-up along the normal.
-            jobs: Number of processes that compute the stops after the considered impacts.
+            jobs: Number of processes that time the path, and compute the stops after the considered impacts.
 
         Raises:
             InputError: The package TOPP-RA (``impact-posture[path]``) is not installed, or the contact cannot strike.
@@ -185,7 +185,7 @@ class PostureResult:
         from impact_posture.path.posture_path import posture_path
 
         if not strike:
-            return replace(self, motion=posture_path(self.solution, seed=seed))
+            return replace(self, motion=posture_path(self.solution, seed=seed, jobs=jobs))
         impact = self._prepared.impact
         motion = posture_path(
             self.solution, seed=seed, strike=impact.speed, restitution=impact.restitution, jobs=jobs

@@ -108,7 +108,7 @@ def time_optimal(
     return motion if _exceeded(space, motion, limits) <= _EXCEEDED else None
 
 
-def scaled(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedCurve:
+def scaled(space: PathSpace, curve: PathCurve, limits: ActuatorLimits, jobs: int = 1) -> TimedCurve:
     """Return the fastest motion of the form ``s(t) = 10 τ³ − 15 τ⁴ + 6 τ⁵``, ``τ = t/T``, within all known limits.
 
     The load of a motion is the load of gravity plus ``1/T²`` times a load that does not depend on ``T``.  So a linear
@@ -121,7 +121,7 @@ def scaled(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedC
     rates = [moment(curve, law, x) for x in tau.tolist()]
     speed, known = space.problem.robot.velocity_limits, not limits.missing
     least = np.zeros(len(tau))
-    slower = slowed(space, curve, limits) if known and curve.corners.any() else None
+    slower = slowed(space, curve, limits, jobs) if known and curve.corners.any() else None
     if known:
         zero, largest = np.zeros(space.model.nv), list[float | None]()
         rests = [(q, limits.load(q, zero, zero)) for q, _, _ in rates]
@@ -158,15 +158,15 @@ def _cannot_move(space: PathSpace, limits: ActuatorLimits, loads: Sequence[tuple
     return f"{limits.names[int(worst.argmax())]} would need {worst.max():.3g} times its limit at rest on the path"
 
 
-def timed(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedCurve:
+def timed(space: PathSpace, curve: PathCurve, limits: ActuatorLimits, jobs: int = 1) -> TimedCurve:
     """Return the motion along a curve: time-optimal for a fixed base with known torque limits, else scaled.
 
     If a time-optimal motion exceeds limits between the points of its grid, the slowed motion replaces it.
     """
     motion = time_optimal(space, curve, limits)
     if motion is None and topp_ra_times(space, limits):
-        motion = slowed(space, curve, limits)
-    return scaled(space, curve, limits) if motion is None else motion
+        motion = slowed(space, curve, limits, jobs)
+    return scaled(space, curve, limits, jobs) if motion is None else motion
 
 
 def topp_ra_times(space: PathSpace, limits: ActuatorLimits) -> bool:

@@ -132,7 +132,8 @@ def posture_path(
     (:mod:`~impact_posture.path.strike`).  If no optimum allows a strike at this speed, the path ends at the optimum
     with the greatest speed.  If no optimum allows a strike at any speed, the path ends at rest.  ``restitution`` is
     the coefficient of the predicted impact, after which :mod:`~impact_posture.path.follow_through` stops the robot.
-    If nothing supports the robot, its path is a fall to the optimum.  ``jobs`` processes compute the stops.
+    If nothing supports the robot, its path is a fall to the optimum.  ``jobs`` processes time the path
+    and compute the stops.
 
     Raises:
         InputError: The package of the extra ``path`` is not installed, or the contact cannot strike.
@@ -154,7 +155,7 @@ def posture_path(
     postures = connection.path or [start]
     if len(postures) == 1:
         return _still(space, start, failure, no_strike)
-    motion = _timed(space, postures, limits, seed)
+    motion = _timed(space, postures, limits, seed, jobs)
     if motion is None:
         return _still(space, start, _NOT_SMOOTH, no_strike)
     return _finished(space, motion, connection.method, limits, failure, no_strike)
@@ -183,10 +184,12 @@ def _fault(space: PathSpace, start: Array) -> str:
     return f"the start violates: {', '.join(violated)}" if violated else ""
 
 
-def _timed(space: PathSpace, postures: list[Array], limits: ActuatorLimits, seed: int) -> TimedCurve | None:
+def _timed(
+    space: PathSpace, postures: list[Array], limits: ActuatorLimits, seed: int, jobs: int
+) -> TimedCurve | None:
     """Return the timed motion along a path from rest to rest; ``None`` if no smooth curve is on the constraints."""
     curve = fitted_curve(space, shortened(space, postures, seed)) or fitted_curve(space, postures)
-    return None if curve is None else timed(space, curve, limits)
+    return None if curve is None else timed(space, curve, limits, jobs)
 
 
 def _finished(
@@ -234,7 +237,7 @@ def _struck(
             failure = failure or slow
             slower.append((k, run))
         else:
-            led = _led(solution.initial, run, limits, seed, effort)
+            led = _led(solution.initial, run, limits, seed, effort, jobs)
             if not isinstance(led, str):
                 best = k, *led
                 break
@@ -243,7 +246,7 @@ def _struck(
     while slower and best is None:
         enough = max(run.strike.speed for _, run in slower) / _FASTER
         k, run = slower.pop(next(i for i, (_, run) in enumerate(slower) if run.strike.speed >= enough))
-        led = _led(solution.initial, run, limits, seed, effort)
+        led = _led(solution.initial, run, limits, seed, effort, jobs)
         if not isinstance(led, str):
             best = k, *led
         elif k == 0:
@@ -258,7 +261,9 @@ def _struck(
     return _finished(run.spaces.approach, run.motion, method, limits, failure, strike=strike)
 
 
-def _led(start: Array, run: RunUp, limits: ActuatorLimits, seed: int, effort: int) -> tuple[RunUp, str] | str:
+def _led(
+    start: Array, run: RunUp, limits: ActuatorLimits, seed: int, effort: int, jobs: int
+) -> tuple[RunUp, str] | str:
     """Return a run-up preceded by a motion from the start, and the search method; or why no such motion exists."""
     space, motion = run.spaces.approach, run.motion
     if motion.method == FREE_FALL:
@@ -277,7 +282,7 @@ def _led(start: Array, run: RunUp, limits: ActuatorLimits, seed: int, effort: in
         return replace(run, motion=replace(motion, notes=notes)), connection.method
     if (whole := _in_one_piece(run, shortened(space, connection.path, seed), limits, notes)) is not None:
         return whole, connection.method
-    there = _timed(space, connection.path, limits, seed)
+    there = _timed(space, connection.path, limits, seed, jobs)
     if there is None:
         return _NOT_SMOOTH
     motion = TimedCurve(there.rows.followed_by(motion.rows), there.method, (*there.notes, *notes))
