@@ -150,7 +150,7 @@ def lay_out_warps(graph: Graph, outputs: Sequence[str], plan: WarpSchedule) -> L
     own, sizes = assign_slots(graph, steps, last | dict.fromkeys(shared, -1))
     exchanged, size = assign_slots(graph, steps, {k: last[k] if k in shared else -1 for k in computed})
     return Layout(
-        graph, tuple(Block(frozenset([warp]), tuple(nodes)) for (_, warp), nodes in sorted(blocks.items())),
+        graph, tuple(Block(frozenset([0]), tuple(nodes)) for _, nodes in sorted(blocks.items())),
         frozenset(inlined), own | exchanged, sizes, angles, trig, leaves_of(graph, every), shared,
         size.get(1, 0),
     )  # fmt: skip

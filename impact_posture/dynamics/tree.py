@@ -327,7 +327,6 @@ class Tree(Kinematics):
             # In a cluster of several links, the force on one link also depends on the motion of the other links.
             if spin is not None and len(c.joints) == 1:
                 rows[i] = spin_power(inertia, x.before[i], y.before[i], axis=spin.axis, sense=spin.sense)
-                self.visit(i, rows[i])
                 forces[0][i], forces[1][i] = x.passed[i], y.passed[i]
         return self._gather([(y.before, forces[0]), (x.before, forces[1])], turning, rows)
 

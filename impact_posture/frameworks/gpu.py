@@ -58,13 +58,11 @@ class Kernel:
         function: The kernel; ``function.ptr`` is its ``CUfunction``.
         block: Number of threads in a block.
         rows: Number of rows that a block computes.
-        shared: Dynamic shared memory of a block, in bytes.
     """
 
     function: Any
     block: int
     rows: int
-    shared: int
 
 
 class BatchMetric:
@@ -154,7 +152,7 @@ class BatchMetric:
         if count:
             # The last argument is a null pointer in place of the array of return codes.
             arguments = (q, *normals, np.int32(count), value, grad, 0)
-            kernel.function((-(-count // kernel.rows),), (kernel.block,), arguments, kernel.shared)
+            kernel.function((-(-count // kernel.rows),), (kernel.block,), arguments)
         return value, grad
 
     def kernel(self, name: str, device: int) -> Kernel:
@@ -177,7 +175,7 @@ class BatchMetric:
                 function = module.get_function(expression).kernel
             # An earlier version wrote a header without this macro; there, each thread computes a row.
             rows = re.search(r"^#define \w+_ROWS (\d+)$", code, re.MULTILINE)
-            kernel = Kernel(function, BLOCK_THREADS, int(rows[1]) if rows else BLOCK_THREADS, 0)
+            kernel = Kernel(function, BLOCK_THREADS, int(rows[1]) if rows else BLOCK_THREADS)
             self._kernels[name, device] = kernel
         return kernel
 

@@ -96,10 +96,10 @@ class JaxMetric:
                 fault = str(error)
         # A compiled program may be called after the metric is deleted.
         _KEPT.extend(kernels)
-        shape = kernels[0] if kernels else gpu.Kernel(None, 1, 1, 0)
+        shape = kernels[0] if kernels else gpu.Kernel(None, 1, 1)
         numbers = {
             "batch": _address(self.batch.gradient.batch_function(name)), "launch": launch, "block": shape.block,
-            "rows": shape.rows, "shared": shape.shared,
+            "rows": shape.rows,
         }  # fmt: skip
         addresses = np.array([kernel.function.ptr for kernel in kernels] or [0], dtype=np.int64)
         return {"fault": fault, "kernels": addresses} | {key: np.int64(number) for key, number in numbers.items()}

@@ -98,9 +98,9 @@ class Cupy:
         name, threads = expression.removesuffix(">").split("_kernel<")
         function = getattr(self.library, f"{name}_rows" if name.endswith("eval") else f"{name}_batch")
 
-        def kernel(grid: Any, block: Any, arguments: Any, shared: int) -> None:
+        def kernel(grid: Any, block: Any, arguments: Any) -> None:
             q, *normals, count, value, grad, status = arguments
-            assert grid[0] * block[0] >= count and block[0] == int(threads) and (status, shared) == (0, 0)
+            assert grid[0] * block[0] >= count and block[0] == int(threads) and status == 0
             pointers = [ctypes.c_void_p(array.ctypes.data) for array in (q, *normals[:1], value, grad)]
             pointers.insert(-2, ctypes.c_int(count))
             if normals:

@@ -20,9 +20,8 @@
  *   kernels  array: the kernel <stem>_eval_kernel or <stem>_objective_kernel (CUfunction) for each GPU
  *   launch   address of cuLaunchKernel
  *   rows     rows that a block computes
- *   shared   bytes of dynamic shared memory of a block
  */
-enum { BATCH, BLOCK, FAULT, KERNELS, LAUNCH, BLOCK_ROWS, SHARED };
+enum { BATCH, BLOCK, FAULT, KERNELS, LAUNCH, BLOCK_ROWS };
 
 /* Number of rows that a thread of the CPU computes between two looks at the number of rows that are left. */
 enum { ROWS = 256 };
@@ -223,7 +222,7 @@ XLA_FFI_Error *impact_posture_launch(XLA_FFI_CallFrame *frame)
   rows = number(frame, BLOCK_ROWS);
   if (((Launch *)(intptr_t)number(frame, LAUNCH))(
         (void *)work.function, (unsigned)((work.count + rows - 1) / rows), 1, 1, (unsigned)number(frame, BLOCK), 1, 1,
-        (unsigned)number(frame, SHARED), stream.stream, arguments, NULL) != 0) {
+        0, stream.stream, arguments, NULL) != 0) {
     return error(work.api, "cuLaunchKernel failed", XLA_FFI_Error_Code_INTERNAL);
   }
   return NULL;
